@@ -1,0 +1,16 @@
+"""CRC-RL for Stable-Baselines3: SAC from pixels with contrastive, reconstruction and consistency losses."""
+
+from importlib.metadata import version
+
+from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.decoder import PixelDecoder
+from sb3_crc.encoder import PixelEncoder
+from sb3_crc.envs.dmc import make_dmc
+from sb3_crc.envs.tasks import register_environments
+from sb3_crc.policies import CRCPolicy
+from sb3_crc.presets import PRESETS
+
+__version__ = version("sb3-crc")
+__all__ = ["CRCSAC", "PRESETS", "CRCPolicy", "PixelDecoder", "PixelEncoder", "make_dmc"]
+
+register_environments()

@@ -1,0 +1,153 @@
+"""The convolutional encoder that critic, actor and objectives share.
+
+B batch, C channels (of the whole frame stack), H, W image height and width, F flattened convolution output, Z latent.
+"""
+
+from collections.abc import Sequence
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import (
+    is_image_space,
+    is_image_space_channels_first,
+)
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_crc.augmentations import ImageSize, center_crop
+
+LATENT_ACTIVATIONS: dict[str, type[nn.Module]] = {"none": nn.Identity, "tanh": nn.Tanh}
+
+
+class PixelEncoder(BaseFeaturesExtractor):
+    """
+    Convolutions, then a linear projection with LayerNorm: the encoder of SAC+AE (arXiv 1910.01741), CURL and CRC-RL.
+
+    It takes bytes, which it scales to [0, 1] itself, or floats that are scaled already (as SB3 hands them to any features
+    extractor), and cuts the middle out of images that are larger than ``image_size``.
+
+    :param observation_space: channel-first uint8 images ``(C, H, W)``
+    :param features_dim: latent dimension Z
+    :param image_size: height and width of the input of the convolutions in pixels (one number: both); None: the whole image
+    :param channels: filters of each convolution
+    :param strides: stride of each convolution
+    :param kernel_size: side of each kernel
+    :param latent_activation: ``"none"`` or ``"tanh"``, after the LayerNorm
+    :param center_input: feed pixels / 255 - 0.5 instead of pixels / 255
+    :raises ValueError: if the space is not one of images, or these are too small for the convolutions
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        features_dim: int = 50,
+        *,
+        image_size: ImageSize | None = None,
+        channels: Sequence[int] = (32, 32, 32, 32),
+        strides: Sequence[int] = (2, 1, 1, 1),
+        kernel_size: int = 3,
+        latent_activation: str = "none",
+        center_input: bool = False,
+    ):
+        frame_stack, *frame_size = image_shape(observation_space)
+        super().__init__(observation_space, features_dim)
+        if len(channels) != len(strides):
+            raise ValueError(f"channels={tuple(channels)} and strides={tuple(strides)} must have the same length")
+        if image_size is None:
+            height, width = frame_size
+        else:
+            height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+        if not (0 < height <= frame_size[0] and 0 < width <= frame_size[1]):
+            raise ValueError(f"image_size={image_size} must lie within the observation, {frame_size[0]}x{frame_size[1]} pixels")
+
+        self.input_shape = (frame_stack, height, width)
+        self.channels = tuple(channels)
+        self.strides = tuple(strides)
+        self.kernel_size = kernel_size
+        self.latent_activation = latent_activation
+        self.center_input = center_input
+
+        layers: list[nn.Module] = []
+        for c_in, c_out, stride in zip((frame_stack, *channels), channels, strides, strict=False):
+            layers += [nn.Conv2d(c_in, c_out, kernel_size, stride), nn.ReLU()]
+        self.convolutions = nn.Sequential(*layers)
+        minimum = smallest_input(self.strides, kernel_size)
+        if min(height, width) < minimum:
+            raise ValueError(f"images of {height}x{width} pixels are too small for this encoder: it needs {minimum}x{minimum}")
+        with th.no_grad():
+            #: Shape of the last convolution's output, ``(channels, height, width)``
+            self.convolution_shape = tuple(self.convolutions(th.zeros(1, *self.input_shape)).shape[1:])
+        self.projection = latent_projection(int(th.tensor(self.convolution_shape).prod()), features_dim, latent_activation)
+        self.apply(init_orthogonal)
+        self.convolutions.to(memory_format=th.channels_last)  # oneDNN: 3x faster than the default layout
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """:param observations: ``(B, C, H, W)``, uint8 or floats in [0, 1]; :return: latents ``(B, Z)``"""
+        return self.project(self.convolve(observations))
+
+    def convolve(self, observations: th.Tensor) -> th.Tensor:
+        """:param observations: ``(B, C, H, W)``, uint8 or floats in [0, 1]; :return: convolution output ``(B, F)``"""
+        images = center_crop(observations, self.input_shape[1:])
+        pixels = scale_pixels(images) if images.dtype == th.uint8 else images.contiguous(memory_format=th.channels_last)
+        if self.center_input:
+            pixels = pixels - 0.5
+        return self.convolutions(pixels).flatten(start_dim=1)
+
+    def project(self, features: th.Tensor) -> th.Tensor:
+        """:param features: convolution output ``(B, F)``; :return: latents ``(B, Z)``"""
+        return self.projection(features)
+
+
+def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.Sequential:
+    """
+    What turns convolution output into a latent: Linear, LayerNorm and, if named, an activation.
+
+    :raises ValueError: for an unknown activation
+    """
+    if activation not in LATENT_ACTIVATIONS:
+        raise ValueError(f"unknown latent_activation {activation!r}; known: {', '.join(LATENT_ACTIVATIONS)}")
+    return nn.Sequential(nn.Linear(in_features, latent_dim), nn.LayerNorm(latent_dim), LATENT_ACTIVATIONS[activation]())
+
+
+def scale_pixels(images: th.Tensor) -> th.Tensor:
+    """The one place where bytes become floats. :return: float32 in [0, 1], channels last in memory"""
+    return images.to(th.float32, memory_format=th.channels_last).div_(255.0)
+
+
+def image_shape(observation_space: spaces.Space) -> tuple[int, ...]:
+    """
+    :return: ``(C, H, W)`` of a space of byte images
+    :raises ValueError: if the space is anything else
+    """
+    if not is_image_space(observation_space) or not is_image_space_channels_first(observation_space):  # type: ignore[arg-type]
+        raise ValueError(f"expected uint8 images (channels, height, width) with values in [0, 255], got {observation_space}")
+    assert observation_space.shape is not None
+    return observation_space.shape
+
+
+def smallest_input(strides: Sequence[int], kernel_size: int) -> int:
+    """:return: the smallest side in pixels from which convolutions without padding leave at least one pixel"""
+    side = 1
+    for stride in reversed(strides):
+        side = (side - 1) * stride + kernel_size
+    return side
+
+
+def init_orthogonal(module: nn.Module) -> None:
+    """
+    Initialise one layer in place (use with ``module.apply``): linear layers orthogonal with zero bias, convolutions
+    delta-orthogonal (Xiao et al. 2018, arXiv 1806.05393) with gain sqrt 2 where their kernel has a middle.
+    """
+    if isinstance(module, nn.Linear):
+        nn.init.orthogonal_(module.weight)
+        nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+        height, width = module.kernel_size
+        gain = nn.init.calculate_gain("relu")
+        if height == width and height % 2 == 1:
+            nn.init.zeros_(module.weight)
+            nn.init.orthogonal_(module.weight.data[:, :, height // 2, width // 2], gain)
+        else:
+            nn.init.orthogonal_(module.weight, gain)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)

@@ -1,0 +1,72 @@
+"""The reconstruction loss of SAC+AE and CRC-RL: does the latent hold what the image shows?
+
+B batch, C channels, H, W height and width, Z latent.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from torch.nn import functional as F
+from typing_extensions import Self
+
+from sb3_crc.decoder import PixelDecoder
+from sb3_crc.encoder import PixelEncoder
+from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.views import Views
+
+
+def reconstruction_loss(decoded: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """
+    Mean squared error over batch, channels and pixels: -log p(x|s) of CRC-RL's L_r for a Gaussian, up to constants.
+
+    :param decoded: ``(B, C, H, W)``
+    :param target: ``(B, C, H, W)``
+    :return: scalar
+    """
+    return F.mse_loss(decoded, target)
+
+
+class Reconstruction(AuxiliaryObjective):
+    """
+    L_r of CRC-RL: paint the anchor from its own latent, with penalties on the latent and on the decoder's weights (as in
+    regularised autoencoders, arXiv 1903.12436).
+
+    :param channels: filters of the encoder's convolutions, which the decoder mirrors
+    :param strides: their strides
+    :param kernel_size: the side of their kernels
+    :param latent_penalty: lambda_s, factor of the mean over the batch of ``||s||^2 / 2``
+    :param decoder_penalty: lambda_theta, factor of ``||theta||^2 / 2``
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        observation_shape: tuple[int, int, int],
+        action_dim: int,
+        *,
+        channels: Sequence[int] = (32, 32, 32, 32),
+        strides: Sequence[int] = (2, 1, 1, 1),
+        kernel_size: int = 3,
+        latent_penalty: float = 1e-6,
+        decoder_penalty: float = 1e-7,
+    ):
+        super().__init__(latent_dim, observation_shape, action_dim)
+        self.latent_penalty = latent_penalty
+        self.decoder_penalty = decoder_penalty
+        self.decoder = PixelDecoder(latent_dim, observation_shape, channels=channels, strides=strides, kernel_size=kernel_size)
+
+    @classmethod
+    def for_encoder(cls, encoder: PixelEncoder, action_dim: int, **own: Any) -> Self:
+        mirrored = {"channels": encoder.channels, "strides": encoder.strides, "kernel_size": encoder.kernel_size}
+        return super().for_encoder(encoder, action_dim, **{**mirrored, **own})
+
+    def forward(self, views: Views) -> th.Tensor:
+        latent = views.anchor.latent
+        loss = reconstruction_loss(self.decoder(latent), views.anchor.pixels)
+        if self.latent_penalty > 0:
+            loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
+        if self.decoder_penalty > 0:
+            squares = [parameter.square().sum() for parameter in self.decoder.parameters()]
+            loss = loss + self.decoder_penalty * th.stack(squares).sum() / 2
+        return loss

@@ -1,0 +1,287 @@
+"""Who owns, shares and detaches which weights.
+
+B batch, F flattened convolution output, Z latent, A action.
+
+======================== ============================ ================================ ========================
+weights                  trained by                   gradient of                      followed by
+======================== ============================ ================================ ========================
+encoder                  critic.optimizer and         critic loss; objectives          key_encoder, encoder_tau
+                         encoder_optimizer
+Q heads                  critic.optimizer             critic loss                      target heads, tau
+objectives               encoder_optimizer            objectives
+actor (own projection    actor.optimizer              actor loss
+and heads)
+======================== ============================ ================================ ========================
+"""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
+from sb3_crc.objectives import ObjectiveSettings, build_objectives
+from sb3_crc.views import View
+
+ACTOR_FEATURES = ("conv", "latent")
+
+
+class CRCActor(Actor):
+    """
+    SAC's actor on detached features of the shared encoder.
+
+    :param actor_features: ``"conv"``: the convolutions' output through a projection of the actor's own (CURL, SAC+AE, DrQ);
+        ``"latent"``: the encoder's latent
+    :param log_std_bounds: the log standard deviation is squashed into them by a tanh
+    :param layer_norm: LayerNorm before each activation of the heads
+    """
+
+    features_extractor: PixelEncoder
+
+    def __init__(
+        self,
+        *args: Any,
+        actor_features: str = "conv",
+        log_std_bounds: tuple[float, float] = (-10, 2),
+        layer_norm: bool = False,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, **kwargs)
+        encoder = self.features_extractor
+        self.actor_features = actor_features
+        self.log_std_bounds = log_std_bounds
+        self.projection: nn.Module = nn.Identity()
+        if actor_features == "conv":
+            conv_features = encoder.projection[0].in_features
+            self.projection = latent_projection(conv_features, self.features_dim, encoder.latent_activation)
+        self.latent_pi = _heads_mlp(self.features_dim, -1, self.net_arch, self.activation_fn, layer_norm)
+        for module in self.own_modules():
+            module.apply(init_orthogonal)
+
+    def own_modules(self) -> list[nn.Module]:
+        """Everything but the shared encoder."""
+        return [self.projection, self.latent_pi, self.mu, self.log_std]
+
+    def own_parameters(self) -> list[nn.Parameter]:
+        """What the actor loss trains."""
+        return [parameter for module in self.own_modules() for parameter in module.parameters()]
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        """:param obs: images ``(B, C, H, W)``, uint8; :return: mean and log std ``(B, A)``, and an empty dict"""
+        assert isinstance(obs, th.Tensor)
+        with th.no_grad():  # the encoder is not the actor's to train
+            features = self.features_extractor.convolve(obs)
+            if self.actor_features == "latent":
+                features = self.features_extractor.project(features)
+        mean_actions, log_std = self._dist_params(features)
+        return mean_actions, log_std, {}
+
+    def view_log_prob(self, view: View) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Sample actions for a view whose encoding is shared with the critic and the objectives.
+
+        :return: actions ``(B, A)`` and their log probabilities ``(B, 1)``, with gradient to the actor's own weights only
+        """
+        features = view.features if self.actor_features == "conv" else view.latent
+        actions, log_prob = self.action_dist.log_prob_from_params(*self._dist_params(features.detach()))
+        return actions, log_prob.unsqueeze(1)
+
+    def _dist_params(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        latent_pi = self.latent_pi(self.projection(features))
+        low, high = self.log_std_bounds
+        assert isinstance(self.log_std, nn.Linear)
+        log_std = low + 0.5 * (high - low) * (th.tanh(self.log_std(latent_pi)) + 1)
+        return self.mu(latent_pi), log_std
+
+
+class CRCCritic(ContinuousCritic):
+    """
+    Q networks on the encoder's latent; called with images, it is SB3's ContinuousCritic with gradient to the encoder.
+
+    :param layer_norm: LayerNorm before each activation of the heads
+    """
+
+    features_extractor: PixelEncoder
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        n_critics: int = 2,
+        share_features_extractor: bool = True,
+        *,
+        layer_norm: bool = False,
+    ):
+        # SB3's own heads are built empty and replaced: create_mlp's LayerNorm cannot be asked for from outside.
+        # To SB3, "share" means that the critic must not train the encoder: here it must.
+        super().__init__(
+            observation_space,
+            action_space,
+            [],
+            features_extractor,
+            features_dim,
+            activation_fn,
+            normalize_images,
+            n_critics,
+            share_features_extractor=False,
+        )
+        self.q_networks = []
+        for index in range(n_critics):
+            inputs = features_dim + get_action_dim(action_space)
+            head = _heads_mlp(inputs, 1, net_arch, activation_fn, layer_norm).apply(init_orthogonal)
+            self.add_module(f"qf{index}", head)
+            self.q_networks.append(head)
+
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        """:param obs: images ``(B, C, H, W)``, uint8, scaled by the encoder; :return: latents ``(B, Z)``"""
+        return features_extractor(obs)
+
+    def q_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """:param latents: ``(B, Z)``; :param actions: ``(B, A)``; :return: ``(B, n_critics)``"""
+        inputs = th.cat([latents, actions], dim=1)
+        return th.cat([head(inputs) for head in self.q_networks], dim=1)
+
+    def head_parameters(self) -> list[nn.Parameter]:
+        """The weights of the Q networks, without the encoder."""
+        return [parameter for head in self.q_networks for parameter in head.parameters()]
+
+
+class CRCPolicy(SACPolicy):
+    """
+    SAC's policy with one encoder for critic, actor and objectives, and its moving average as target and key encoder.
+
+    :param observation_space: channel-first uint8 images
+    :param action_space: a Box
+    :param lr_schedule: of the actor
+    :param net_arch: hidden layers of the heads, as in SB3; default ``[1024, 1024]`` (CRC-RL)
+    :param features_extractor_class: :class:`PixelEncoder` or a subclass
+    :param features_extractor_kwargs: arguments of the encoder
+    :param objectives: name -> weight, or name -> ``{"weight": w, **settings}``
+    :param qf_lr_schedule: of Q heads and encoder under the critic loss; None: ``lr_schedule``
+    :param encoder_lr_schedule: of encoder and objectives under the auxiliary losses; None: ``lr_schedule``
+    :param actor_features: see :class:`CRCActor`
+    :param log_std_bounds: see :class:`CRCActor`
+    :param layer_norm: LayerNorm before each activation of actor and Q heads
+    :raises ValueError: for what cannot work: gSDE, unscaled images, an encoder that is not a PixelEncoder, ...
+    """
+
+    actor: CRCActor
+    critic: CRCCritic
+    critic_target: CRCCritic
+    key_encoder: PixelEncoder
+    objectives: nn.ModuleDict
+    encoder_optimizer: th.optim.Optimizer | None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        use_sde: bool = False,
+        features_extractor_class: type[BaseFeaturesExtractor] = PixelEncoder,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        *,
+        objectives: ObjectiveSettings | None = None,
+        qf_lr_schedule: Schedule | None = None,
+        encoder_lr_schedule: Schedule | None = None,
+        actor_features: str = "conv",
+        log_std_bounds: tuple[float, float] = (-10, 2),
+        layer_norm: bool = False,
+    ):
+        if use_sde:
+            raise ValueError("use_sde=True is not supported: gSDE would need exploration noise on the shared features")
+        if not normalize_images:
+            raise ValueError("normalize_images=False is not supported: the encoder takes bytes and scales them itself")
+        if not issubclass(features_extractor_class, PixelEncoder):
+            raise ValueError(f"features_extractor_class must be a PixelEncoder, got {features_extractor_class.__name__}")
+        if actor_features not in ACTOR_FEATURES:
+            raise ValueError(f"unknown actor_features {actor_features!r}; known: {', '.join(ACTOR_FEATURES)}")
+        self._own_kwargs: dict[str, Any] = {
+            "objectives": objectives or {},
+            "actor_features": actor_features,
+            "log_std_bounds": tuple(log_std_bounds),
+            "layer_norm": layer_norm,
+        }
+        self._schedules = qf_lr_schedule or lr_schedule, encoder_lr_schedule or lr_schedule
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            [1024, 1024] if net_arch is None else net_arch,
+            activation_fn,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            n_critics=n_critics,
+            share_features_extractor=True,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        qf_lr_schedule, encoder_lr_schedule = self._schedules
+        self.critic = self.make_critic()
+        encoder = self.critic.features_extractor
+        self.actor = self.make_actor(encoder)
+        self.objectives = build_objectives(self._own_kwargs["objectives"], encoder, get_action_dim(self.action_space))
+
+        # Copies come last, so that they start equal to what they follow (the release re-initialises the encoder after)
+        self.critic_target = self.make_critic()
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target.requires_grad_(False)
+        self.critic_target.set_training_mode(False)
+        self.key_encoder = self.critic_target.features_extractor
+
+        self.actor.optimizer = self._optimizer(self.actor.own_parameters(), lr_schedule)
+        self.critic.optimizer = self._optimizer(list(self.critic.parameters()), qf_lr_schedule)
+        self.encoder_optimizer = None
+        if self.objectives:
+            parameters = [*encoder.parameters(), *self.objectives.parameters()]
+            self.encoder_optimizer = self._optimizer(parameters, encoder_lr_schedule)
+
+    def _optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> CRCActor:
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        own = {key: self._own_kwargs[key] for key in ("actor_features", "log_std_bounds", "layer_norm")}
+        return CRCActor(**kwargs, **own).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> CRCCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return CRCCritic(**kwargs, layer_norm=self._own_kwargs["layer_norm"]).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch online networks and objectives; target heads and key encoder stay in evaluation mode."""
+        super().set_training_mode(mode)
+        self.objectives.train(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for fixed in ("use_sde", "log_std_init", "use_expln", "clip_mean"):
+            del data[fixed]
+        return {**data, **self._own_kwargs}
+
+
+def _heads_mlp(
+    input_dim: int, output_dim: int, net_arch: list[int], activation_fn: type[nn.Module], layer_norm: bool
+) -> nn.Sequential:
+    modules = create_mlp(input_dim, output_dim, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm] * layer_norm)
+    return nn.Sequential(*modules)

@@ -1,0 +1,141 @@
+"""Each loss against its closed form and against an independent derivation in NumPy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_crc.objectives import (
+    OBJECTIVES,
+    Consistency,
+    Contrastive,
+    Reconstruction,
+    build_objectives,
+    consistency_loss,
+    info_nce,
+    reconstruction_loss,
+)
+from sb3_crc.encoder import PixelEncoder
+from tests.test_encoder import image_space
+
+SHAPE = (3, 40, 40)
+
+
+def test_info_nce_is_log_b_when_keys_tell_nothing() -> None:
+    query, key = th.randn(32, 8), th.ones(32, 8)
+    assert info_nce(query, key, th.eye(8)).item() == pytest.approx(math.log(32), rel=1e-6)
+    assert info_nce(query, th.randn(32, 8), th.zeros(8, 8)).item() == pytest.approx(math.log(32), rel=1e-6)
+
+
+def test_info_nce_of_orthogonal_pairs_in_closed_form() -> None:
+    eye = th.eye(6)
+    for scale in (0.5, 3.0):
+        expected = -scale + math.log(math.exp(scale) + 5)
+        assert info_nce(eye, eye, scale * eye).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_info_nce_equals_numpy() -> None:
+    rng = np.random.default_rng(0)
+    query, key, bilinear = rng.normal(size=(7, 5)), rng.normal(size=(7, 5)), rng.normal(size=(5, 5))
+    total = 0.0
+    for i in range(7):  # sample by sample, as the paper writes it
+        scores = [math.exp(query[i] @ bilinear @ key[j]) for j in range(7)]
+        total -= math.log(scores[i] / sum(scores))
+    assert info_nce(*(th.tensor(x) for x in (query, key, bilinear))).item() == pytest.approx(total / 7, rel=1e-5)
+
+
+def test_reconstruction_loss_equals_numpy() -> None:
+    rng = np.random.default_rng(0)
+    decoded, target = rng.normal(size=(4, 3, 5, 6)), rng.normal(size=(4, 3, 5, 6))
+    expected = sum((d - t) ** 2 for d, t in zip(decoded.ravel(), target.ravel(), strict=True)) / decoded.size
+    assert reconstruction_loss(th.tensor(decoded), th.tensor(target)).item() == pytest.approx(expected)
+    assert reconstruction_loss(th.full((2, 3, 4, 4), 0.25), th.full((2, 3, 4, 4), 0.75)).item() == 0.25
+
+
+def test_consistency_loss_equals_numpy_in_both_reductions() -> None:
+    rng = np.random.default_rng(0)
+    predicted, target = rng.normal(size=(4, 10)), rng.normal(size=(4, 10))
+    expected = sum(np.linalg.norm(p - t) ** 2 for p, t in zip(predicted, target, strict=True)) / 4
+    pair = th.tensor(predicted), th.tensor(target)
+    assert consistency_loss(*pair).item() == pytest.approx(expected)
+    assert consistency_loss(*pair, reduction="mean").item() == pytest.approx(expected / 10)
+    with pytest.raises(ValueError, match="median.*sum, mean"):
+        consistency_loss(*pair, reduction="median")
+
+
+def test_consistency_trains_both_sides() -> None:
+    predicted, target = th.ones(2, 3, requires_grad=True), th.zeros(2, 3, requires_grad=True)
+    consistency_loss(predicted, target).backward()
+    assert th.equal(predicted.grad, th.ones(2, 3)) and th.equal(target.grad, -th.ones(2, 3))
+
+
+def test_the_bilinear_matrix_starts_positive_and_stays_symmetric() -> None:
+    objective = Contrastive(16, SHAPE, 2)
+    assert th.allclose(objective.bilinear, th.eye(16) / 4)
+    with th.no_grad():
+        objective.weight += th.randn(16, 16)
+    assert th.equal(objective.bilinear, objective.bilinear.T)
+
+
+def test_reconstruction_adds_the_papers_penalties() -> None:
+    class Anchor:
+        latent = th.randn(4, 16)
+        pixels = th.rand(4, *SHAPE)
+
+    class Batch:
+        anchor = Anchor
+
+    objective = Reconstruction(16, SHAPE, 2, channels=(8,), strides=(2,), latent_penalty=0.3, decoder_penalty=0.01)
+    squared_error = ((objective.decoder(Anchor.latent) - Anchor.pixels) ** 2).mean()
+    latent = 0.3 * (Anchor.latent**2).sum() / 4 / 2
+    weights = 0.01 * sum((parameter**2).sum() for parameter in objective.decoder.parameters()) / 2
+    assert objective(Batch).item() == pytest.approx((squared_error + latent + weights).item(), rel=1e-5)
+
+
+def test_settings_reach_the_objective_and_the_decoder_mirrors_the_encoder() -> None:
+    encoder = PixelEncoder(image_space(3, 40), channels=(8, 16), strides=(2, 2), features_dim=16)
+    modules = build_objectives(
+        {"reconstruction": 0.5, "consistency": {"weight": 0.5, "hidden_dim": 7, "reduction": "mean"}}, encoder, 2
+    )
+    assert modules["reconstruction"].decoder.start_shape == encoder.convolution_shape
+    assert modules["consistency"].predictor[0].out_features == 7
+    assert modules["consistency"].reduction == "mean"
+
+
+class OwnObjective(Consistency):
+    """A user's objective, found by its dotted path."""
+
+
+def test_an_own_objective_is_found_by_its_dotted_path() -> None:
+    encoder = PixelEncoder(image_space(3, 40), features_dim=16)
+    modules = build_objectives({f"{__name__}.OwnObjective": {"weight": 0.1, "hidden_dim": 5}}, encoder, 2)
+    assert type(modules["OwnObjective"]) is OwnObjective
+
+
+@pytest.mark.parametrize(
+    ("objectives", "message"),
+    [
+        ({"contrastiv": 1.0}, "contrastiv.*did you mean 'contrastive'.*reconstruction"),
+        ({"contrastive": -0.1}, "contrastive.*>= 0.*-0.1"),
+        ({"contrastive": float("nan")}, "finite.*nan"),
+        ({"contrastive": {"margin": 1}}, "weight.*None"),
+        ({"contrastive": {"weight": 1, "margin": 1}}, "no setting 'margin'.*weight"),
+        ({"consistency": {"weight": 1, "hiden_dim": 1}}, "no setting 'hiden_dim'.*hidden_dim"),
+        ({"contrastive": 0.0, "consistency": 0}, "all weights.*objectives={}"),
+        ({"no.such.Loss": 1.0}, "cannot be imported"),
+        ({"math.sqrt": 1.0}, "subclass of AuxiliaryObjective"),
+    ],
+)
+def test_bad_settings_are_named(objectives: dict[str, object], message: str) -> None:
+    encoder = PixelEncoder(image_space(3, 40), features_dim=16)
+    with pytest.raises(ValueError, match=message):
+        build_objectives(objectives, encoder, 2)
+
+
+def test_settings_against_the_papers_advice_warn() -> None:
+    encoder = PixelEncoder(image_space(3, 40), features_dim=16)
+    with pytest.warns(UserWarning, match="collapses"):
+        build_objectives({"consistency": 1.0}, encoder, 2)
+    with pytest.warns(UserWarning, match="sum to 1"):
+        build_objectives(dict.fromkeys(OBJECTIVES, 1.0), encoder, 2)

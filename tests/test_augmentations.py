@@ -1,0 +1,72 @@
+"""Augmentations: bytes in, bytes out, every offset, one offset per stack."""
+
+import pytest
+import torch as th
+
+from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_crop, random_shift
+
+
+def coordinates(batch: int, size: int) -> th.Tensor:
+    """Images whose pixels tell where they are: channel 0 and 2 the row, channel 1 and 3 the column."""
+    rows = th.arange(size, dtype=th.uint8).view(-1, 1).expand(size, size)
+    return th.stack([rows, rows.T, rows, rows.T]).expand(batch, 4, size, size).contiguous()
+
+
+def test_random_crop_draws_every_offset_ends_included() -> None:
+    th.manual_seed(0)
+    crops = random_crop(coordinates(2_000, 12), 8)
+    offsets = {(int(top), int(left)) for top, left in crops[:, :2, 0, 0]}
+    assert offsets == {(top, left) for top in range(5) for left in range(5)}
+
+
+def test_random_crop_cuts_one_window_for_the_whole_stack() -> None:
+    crops = random_crop(coordinates(64, 12), (8, 6))
+    assert crops.shape == (64, 4, 8, 6)
+    for crop in crops:
+        top, left = crop[0, 0, 0], crop[1, 0, 0]
+        assert th.equal(crop, coordinates(1, 12)[0, :, top : top + 8, left : left + 6])
+
+
+def test_random_shift_draws_every_shift_and_repeats_the_border() -> None:
+    th.manual_seed(0)
+    shifted = random_shift(coordinates(2_000, 9), pad=2)
+    assert shifted.shape == (2_000, 4, 9, 9)
+    offsets = {(int(row) - 4, int(column) - 4) for row, column in shifted[:, :2, 4, 4]}
+    assert offsets == {(down, right) for down in range(-2, 3) for right in range(-2, 3)}
+    for image in shifted[:50]:
+        down, right = int(image[0, 4, 4]) - 4, int(image[1, 4, 4]) - 4
+        rows = (th.arange(9) + down).clamp(0, 8)
+        columns = (th.arange(9) + right).clamp(0, 8)
+        assert th.equal(image, coordinates(1, 9)[0][:, rows][:, :, columns])
+
+
+def test_center_crop_cuts_the_middle() -> None:
+    crop = center_crop(coordinates(1, 100), 84)
+    assert crop[0, 0, 0, 0] == crop[0, 1, 0, 0] == 8 and crop[0, 0, -1, -1] == 91
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_contract_of_the_registry(name: str) -> None:
+    images = th.randint(0, 256, (5, 9, 20, 20), dtype=th.uint8)
+    before = images.clone()
+    augmented = AUGMENTATIONS[name](images, **({"size": 16} if name.endswith("_crop") else {}))
+    assert augmented.dtype == th.uint8 and augmented.shape[:2] == (5, 9)
+    assert th.equal(images, before), "the sampled batch must not be changed in place"
+
+
+def test_augmentations_are_reproducible_from_torchs_seed() -> None:
+    images = th.randint(0, 256, (32, 3, 20, 20), dtype=th.uint8)
+    for augment in (lambda: random_crop(images, 12), lambda: random_shift(images)):
+        th.manual_seed(1)
+        first = augment()
+        assert not th.equal(first, augment())
+        th.manual_seed(1)
+        assert th.equal(first, augment())
+
+
+def test_bad_sizes_are_named() -> None:
+    images = th.zeros(2, 3, 20, 20, dtype=th.uint8)
+    with pytest.raises(ValueError, match="21x21.*20x20"):
+        random_crop(images, 21)
+    with pytest.raises(ValueError, match="pad=-1"):
+        random_shift(images, -1)

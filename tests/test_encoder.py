@@ -1,0 +1,87 @@
+"""Encoder and decoder: shapes, scaling, cropping, initialisation."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.preprocessing import preprocess_obs
+
+from sb3_crc import PixelDecoder, PixelEncoder
+from tests.conftest import NoiseEnv
+
+
+def image_space(channels: int = 9, height: int = 100, width: int | None = None) -> spaces.Box:
+    return spaces.Box(0, 255, (channels, height, width or height), np.uint8)
+
+
+def test_the_papers_encoder_has_the_published_shapes() -> None:
+    encoder = PixelEncoder(image_space(), image_size=84)
+    assert encoder.input_shape == (9, 84, 84)
+    assert encoder.convolution_shape == (32, 35, 35)  # SAC+AE, CURL: 4 layers, 84 pixels
+    assert encoder(th.zeros(2, 9, 100, 100, dtype=th.uint8)).shape == (2, 50)
+
+
+def test_bytes_and_sb3s_scaled_floats_give_the_same_latent() -> None:
+    space = image_space(3, 48)
+    images = th.randint(0, 256, (4, 3, 48, 48), dtype=th.uint8)
+    for center_input in (False, True):
+        encoder = PixelEncoder(space, center_input=center_input)
+        assert th.equal(encoder(images), encoder(preprocess_obs(images, space)))
+
+
+def test_larger_frames_are_cropped_in_the_middle() -> None:
+    encoder = PixelEncoder(image_space(3, 60), image_size=(48, 40))
+    images = th.randint(0, 256, (4, 3, 60, 60), dtype=th.uint8)
+    assert th.equal(encoder(images), encoder(images[:, :, 6:54, 10:50]))
+
+
+def test_centred_input_is_a_half_lower() -> None:
+    centred, plain = PixelEncoder(image_space(3, 40), center_input=True), PixelEncoder(image_space(3, 40))
+    centred.load_state_dict(plain.state_dict())
+    images = th.rand(2, 3, 40, 40)
+    assert th.allclose(centred(images), plain(images - 0.5))
+
+
+def test_tanh_bounds_the_latent() -> None:
+    images = th.randint(0, 256, (8, 3, 40, 40), dtype=th.uint8)
+    latents = PixelEncoder(image_space(3, 40), latent_activation="tanh")(images)
+    assert latents.abs().max() < 1
+    assert PixelEncoder(image_space(3, 40))(images).abs().max() > 1
+
+
+def test_initialisation_is_orthogonal_and_delta_orthogonal() -> None:
+    encoder = PixelEncoder(image_space(9, 48))
+    kernel = encoder.convolutions[2].weight  # (32, 32, 3, 3)
+    middle = kernel[:, :, 1, 1]
+    assert th.allclose(middle @ middle.T, 2 * th.eye(32), atol=1e-5)  # gain sqrt 2
+    assert kernel.abs().sum() == middle.abs().sum()
+    linear = encoder.projection[0]
+    assert th.allclose(linear.weight @ linear.weight.T, th.eye(50), atol=1e-5)
+    assert not linear.bias.any()
+
+
+@pytest.mark.parametrize(("size", "strides"), [(84, (2, 1, 1, 1)), (64, (2, 2, 2, 1)), (41, (2, 2)), (36, (2, 1, 1, 1))])
+def test_the_decoder_mirrors_the_encoder(size: int, strides: tuple[int, ...]) -> None:
+    channels = (8, 16, 16, 16)[: len(strides)]
+    encoder = PixelEncoder(image_space(3, size), channels=channels, strides=strides)
+    decoder = PixelDecoder(50, (3, size, size), channels=channels, strides=strides)
+    assert decoder.start_shape == encoder.convolution_shape
+    assert decoder(th.zeros(2, 50)).shape == (2, 3, size, size)
+
+
+def test_the_encoder_serves_stock_sac() -> None:
+    model = SAC("CnnPolicy", NoiseEnv(), policy_kwargs={"features_extractor_class": PixelEncoder}, buffer_size=100, batch_size=8)
+    model.learn(102)
+    assert model.predict(NoiseEnv().reset()[0])[0].shape == (2,)
+
+
+def test_bad_input_is_named() -> None:
+    with pytest.raises(ValueError, match="12x12.*needs 15x15"):
+        PixelEncoder(image_space(3, 12), channels=(8,) * 4, strides=(2, 1, 1, 1))
+    with pytest.raises(ValueError, match="image_size=90.*64x64"):
+        PixelEncoder(image_space(3, 64), image_size=90)
+    with pytest.raises(ValueError, match="relu.*none, tanh"):
+        PixelEncoder(image_space(3, 64), latent_activation="relu")
+    with pytest.raises(ValueError, match="expected uint8 images"):
+        PixelEncoder(spaces.Box(0, 1, (3, 64, 64), np.float32))
