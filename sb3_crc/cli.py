@@ -41,7 +41,8 @@ def doctor() -> None:
 @app.command()
 def rendering(
     install: Annotated[
-        bool, typer.Option("--install", help="Install the missing system library as root in a container, or if AUTO_APT=1 or CI=1.")
+        bool,
+        typer.Option("--install", help="Install the missing system library as root in a container, or if AUTO_APT=1 or CI=1."),
     ] = False,
 ) -> None:
     """Print the OpenGL back end that draws without a display; exit code 2 and what mends it if there is none."""

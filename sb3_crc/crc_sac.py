@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import (
@@ -20,7 +19,6 @@ from stable_baselines3.common.utils import (
     update_learning_rate,
 )
 from stable_baselines3.sac.sac import SAC
-from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, center_crop
@@ -69,7 +67,7 @@ class CRCSAC(SAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy}
-    policy: CRCPolicy  # type: ignore[assignment]
+    policy: CRCPolicy
     actor: CRCActor
     critic: CRCCritic
     critic_target: CRCCritic

@@ -45,12 +45,13 @@ class PixelDecoder(nn.Module):
             layers += [nn.ReLU(), _mirrored(channels[depth], outputs[depth], kernel_size, strides[depth], sizes[depth])]
         self.deconvolutions = nn.Sequential(*layers)
         self.apply(init_orthogonal)
-        self.deconvolutions.to(memory_format=th.channels_last)
+        self.deconvolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, latents: th.Tensor) -> th.Tensor:
         """:param latents: ``(B, Z)``; :return: images ``(B, C, H, W)``, unbounded floats meant to match pixels / 255"""
         start = self.linear(latents).unflatten(1, self.start_shape)
-        return self.deconvolutions(start.contiguous(memory_format=th.channels_last))
+        images: th.Tensor = self.deconvolutions(start.contiguous(memory_format=th.channels_last))
+        return images
 
 
 def _mirrored(c_in: int, c_out: int, kernel_size: int, stride: int, size: tuple[int, ...]) -> nn.Module:

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
@@ -58,14 +59,14 @@ class CRCActor(Actor):
         self.log_std_bounds = log_std_bounds
         self.projection: nn.Module = nn.Identity()
         if actor_features == "conv":
-            conv_features = encoder.projection[0].in_features
-            self.projection = latent_projection(conv_features, self.features_dim, encoder.latent_activation)
+            self.projection = latent_projection(encoder.convolution_dim, self.features_dim, encoder.latent_activation)
         self.latent_pi = _heads_mlp(self.features_dim, -1, self.net_arch, self.activation_fn, layer_norm)
         for module in self.own_modules():
             module.apply(init_orthogonal)
 
     def own_modules(self) -> list[nn.Module]:
         """Everything but the shared encoder."""
+        assert isinstance(self.log_std, nn.Linear)
         return [self.projection, self.latent_pi, self.mu, self.log_std]
 
     def own_parameters(self) -> list[nn.Parameter]:
@@ -89,6 +90,7 @@ class CRCActor(Actor):
         :return: actions ``(B, A)`` and their log probabilities ``(B, 1)``, with gradient to the actor's own weights only
         """
         features = view.features if self.actor_features == "conv" else view.latent
+        assert isinstance(self.action_dist, SquashedDiagGaussianDistribution)
         actions, log_prob = self.action_dist.log_prob_from_params(*self._dist_params(features.detach()))
         return actions, log_prob.unsqueeze(1)
 
@@ -111,7 +113,7 @@ class CRCCritic(ContinuousCritic):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         net_arch: list[int],
         features_extractor: BaseFeaturesExtractor,
@@ -145,7 +147,8 @@ class CRCCritic(ContinuousCritic):
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         """:param obs: images ``(B, C, H, W)``, uint8, scaled by the encoder; :return: latents ``(B, Z)``"""
-        return features_extractor(obs)
+        latents: th.Tensor = features_extractor(obs)
+        return latents
 
     def q_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """:param latents: ``(B, Z)``; :param actions: ``(B, A)``; :return: ``(B, n_critics)``"""
@@ -185,7 +188,7 @@ class CRCPolicy(SACPolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
@@ -260,11 +263,13 @@ class CRCPolicy(SACPolicy):
         return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> CRCActor:
+        """:return: an actor on ``features_extractor``"""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         own = {key: self._own_kwargs[key] for key in ("actor_features", "log_std_bounds", "layer_norm")}
         return CRCActor(**kwargs, **own).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> CRCCritic:
+        """:return: Q networks on ``features_extractor``, or on a new encoder"""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return CRCCritic(**kwargs, layer_norm=self._own_kwargs["layer_norm"]).to(self.device)
 

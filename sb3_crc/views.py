@@ -63,7 +63,8 @@ class View:
     def key_latent(self) -> th.Tensor:
         """Latent of the key encoder, ``(B, Z)``, without gradient."""
         with th.no_grad():
-            return self._key_encoder(self.pixels)
+            latents: th.Tensor = self._key_encoder(self.pixels)
+        return latents
 
 
 class Views:

@@ -41,14 +41,14 @@ def preset_class(preset: str) -> type[CRCSAC]:
     return type(preset, (CRCSAC,), {"preset": preset, "__init__": __init__, "__doc__": f"CRCSAC with PRESETS[{preset!r}]."})
 
 
-class CRCExperimentManager(ExperimentManager):  # type: ignore[misc]
+class CRCExperimentManager(ExperimentManager):
     """The zoo's manager, which also finds our configurations, logs into the run's folder and draws what was learned."""
 
-    def __init__(self, args: Any, algo: str, *rest: Any, config: str | None = None, **kwargs: Any):
+    def __init__(self, args: Any, algo: str, *rest: Any, **kwargs: Any):
         own_config = CONFIGS / f"{algo}.yml"
-        if config is None and own_config.exists():
-            config = str(own_config)
-        super().__init__(args, algo, *rest, config=config, **kwargs)
+        if kwargs.get("config") is None and own_config.exists():
+            kwargs["config"] = str(own_config)
+        super().__init__(args, algo, *rest, **kwargs)
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         processed = super()._preprocess_hyperparams(hyperparams)
@@ -105,7 +105,7 @@ def register() -> None:
     """Put the presets into the zoo's table of algorithms, and our manager into its training script."""
     for name in PRESETS:
         rl_zoo3.ALGOS[name] = preset_class(name)
-    rl_zoo3.train.ExperimentManager = CRCExperimentManager
+    rl_zoo3.train.ExperimentManager = CRCExperimentManager  # type: ignore[attr-defined]
 
 
 def train() -> None:

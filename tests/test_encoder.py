@@ -71,7 +71,9 @@ def test_the_decoder_mirrors_the_encoder(size: int, strides: tuple[int, ...]) ->
 
 
 def test_the_encoder_serves_stock_sac() -> None:
-    model = SAC("CnnPolicy", NoiseEnv(), policy_kwargs={"features_extractor_class": PixelEncoder}, buffer_size=100, batch_size=8)
+    model = SAC(
+        "CnnPolicy", NoiseEnv(), policy_kwargs={"features_extractor_class": PixelEncoder}, buffer_size=100, batch_size=8
+    )
     model.learn(102)
     assert model.predict(NoiseEnv().reset()[0])[0].shape == (2,)
 

@@ -1,4 +1,4 @@
-"""``objectives={}`` without augmentation is pixel SAC: an independent implementation, in plain torch, agrees number for number."""
+"""``objectives={}`` without augmentation is pixel SAC: an independent implementation in plain torch agrees with it."""
 
 import copy
 
@@ -17,7 +17,8 @@ class ReferenceSAC:
 
     def __init__(self, model: CRCSAC):
         policy = copy.deepcopy(model.policy)
-        self.convs, self.projection = policy.critic.features_extractor.convolutions, policy.critic.features_extractor.projection
+        encoder = policy.critic.features_extractor
+        self.convs, self.projection = encoder.convolutions, encoder.projection
         self.q = list(policy.critic.q_networks)
         self.target_convs, self.target_projection = copy.deepcopy(self.convs), copy.deepcopy(self.projection)
         self.target_q = copy.deepcopy(self.q)

@@ -21,23 +21,27 @@ def film(model: BaseAlgorithm, environment: VecEnv, path: Path, *, max_decisions
     """
     import av
 
-    fps = environment.metadata.get("render_fps") or 30
+    fps = float(environment.metadata.get("render_fps", 30))  # type: ignore[arg-type]
     observation = environment.reset()
     total = 0.0
+    height, width = (side - side % 2 for side in _picture(environment).shape[:2])  # the codec takes even sides only
     with av.open(str(path), "w") as container:
-        stream = None
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for _ in range(max_decisions):
-            picture = np.ascontiguousarray(environment.render("rgb_array"))
-            height, width = (side - side % 2 for side in picture.shape[:2])  # the codec takes even sides only
-            if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture[:height, :width], format="rgb24")))
+            picture = np.ascontiguousarray(_picture(environment)[:height, :width])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
             action, _ = model.predict(observation, deterministic=True)  # type: ignore[arg-type]
             observation, rewards, dones, _ = environment.step(action)
             total += float(rewards[0])
             if dones[0]:
                 break
-        assert stream is not None
         container.mux(stream.encode())
     return total
+
+
+def _picture(environment: VecEnv) -> np.ndarray:
+    picture = environment.render("rgb_array")
+    if picture is None:
+        raise ValueError("the environment renders no pictures: make it with render_mode='rgb_array'")
+    return picture

@@ -8,6 +8,7 @@ file is also that subprocess's script; run as one it loads MuJoCo, and it import
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import logging
 import os
@@ -23,8 +24,12 @@ from typing import Any
 logger = logging.getLogger(__name__)
 
 PROBE_TIMEOUT = 30.0  # seconds: software drivers compile shaders at the first frame, broken ones hang
-DEBIAN_PACKAGES = ("libegl1", "libopengl0", "libgl1-mesa-dri")  # PyOpenGL loads libOpenGL beside libEGL
+DEBIAN_PACKAGES = {
+    "egl": ("libegl1", "libopengl0", "libgl1-mesa-dri"),  # PyOpenGL loads libOpenGL beside libEGL
+    "osmesa": ("libosmesa6",),
+}
 DISABLED = ("off", "disable", "disabled", "false", "0")  # MUJOCO_GL values with which dm_control draws nothing
+NEEDS_DISPLAY = ("glfw", "on", "enable", "enabled", "true", "1")  # MUJOCO_GL values that mean GLFW to dm_control
 
 _PROBE_SCENE = """
 <mujoco>
@@ -101,16 +106,22 @@ def select_backend() -> str:
     choice is written to ``os.environ``, so child processes inherit it and one process tree probes once.
 
     :return: the back end's name
-    :raises RenderingUnavailable: if none draws, or MUJOCO_GL forbids drawing
+    :raises RenderingUnavailable: if none draws, or MUJOCO_GL forbids drawing or asks for a display that is not there
     """
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if asked in DISABLED:
+        raise RenderingUnavailable(f"Rendering is switched off by MUJOCO_GL={asked}: unset it, or set it to egl or osmesa.")
+    if asked in NEEDS_DISPLAY and "glfw" not in candidates():
+        raise RenderingUnavailable(f"MUJOCO_GL={asked} needs a display: unset it, or set it to egl or osmesa.")
     loaded = sys.modules.get("dm_control._render")
-    chosen = getattr(loaded, "BACKEND", None) or os.environ.get("MUJOCO_GL", "").lower().strip()
-    if chosen in DISABLED:
-        raise RenderingUnavailable(f"Rendering is switched off by MUJOCO_GL={chosen}: unset it, or set it to egl or osmesa.")
-    if chosen:
-        return str(chosen)
-    backend = _first_that_draws().backend
+    bound = getattr(loaded, "BACKEND", None)
+    if bound and (bound != "glfw" or "glfw" in candidates()):
+        return str(bound)
+    backend = asked or _first_that_draws().backend
     os.environ["MUJOCO_GL"] = backend
+    if loaded is not None:
+        # Imported first and without MUJOCO_GL, dm_control binds GLFW, which aborts the process where there is no display.
+        importlib.reload(loaded)
     return backend
 
 
@@ -124,7 +135,8 @@ def prove_backend() -> Probe:
     outcome = probe(backend)
     if not outcome.draws:
         raise RenderingUnavailable(
-            f"MUJOCO_GL={backend} does not draw ({outcome.error}). Unset MUJOCO_GL to try other back ends, or: {mending_line()}"
+            f"MUJOCO_GL={backend} does not draw ({outcome.error}).\n"
+            f"Unset MUJOCO_GL to try other back ends, or mend this one:\n{mending_line()}"
         )
     return outcome
 
@@ -138,14 +150,17 @@ def _first_that_draws() -> Probe:
             return outcome
         failed.append(outcome)
     tried = "\n".join(f"  {outcome.backend}: {outcome.error}" for outcome in failed)
-    raise RenderingUnavailable(f"No OpenGL back end draws on this machine:\n{tried}\nWhat mends it: {mending_line()}")
+    raise RenderingUnavailable(f"No OpenGL back end draws on this machine:\n{tried}\nWhat mends it:\n{mending_line()}")
 
 
 def mending_line() -> str:
     """The command that installs what is missing; on systems other than Debian and Ubuntu, what is needed in words."""
+    packages = _packages()
+    if not packages:
+        return f"unset MUJOCO_GL, which asks for {os.environ['MUJOCO_GL']!r}"
     if shutil.which("apt-get"):
         sudo = "" if _is_root() else "sudo "
-        return f"{sudo}apt-get update && {sudo}apt-get install -y {' '.join(DEBIAN_PACKAGES)}"
+        return f"{sudo}apt-get update && {sudo}apt-get install -y {' '.join(packages)}"
     if platform.system() == "Linux":
         return "install EGL and Mesa's software driver (Fedora: dnf install mesa-libEGL mesa-dri-drivers)"
     if platform.system() == "Darwin":
@@ -153,21 +168,28 @@ def mending_line() -> str:
     return "use Linux, or WSL2 on Windows"
 
 
+def _packages() -> tuple[str, ...]:
+    """Debian packages of the back end that is asked for; empty if MUJOCO_GL asks for one that needs more than a library."""
+    return DEBIAN_PACKAGES.get(os.environ.get("MUJOCO_GL", "").lower().strip() or "egl", ())
+
+
 def install_system_library() -> None:
     """Install Mesa's EGL library with apt, where nobody will mind: as root in a container, or with AUTO_APT=1 or CI=1.
 
+    With MUJOCO_GL=osmesa it installs OSMesa instead.
+
     :raises RenderingUnavailable: if it may not, with the line to run by hand; or if the installation failed
     """
-    if not shutil.which("apt-get") or not may_install():
-        raise RenderingUnavailable(f"No OpenGL back end draws on this machine. What mends it: {mending_line()}")
+    if not shutil.which("apt-get") or not _packages() or not may_install():
+        raise RenderingUnavailable(f"No OpenGL back end draws on this machine. What mends it:\n{mending_line()}")
     sudo = [] if _is_root() else ["sudo", "-n"]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    for arguments in (["update"], ["install", "-y", "--no-install-recommends", *DEBIAN_PACKAGES]):
+    for arguments in (["update"], ["install", "-y", "--no-install-recommends", *_packages()]):
         command = [*sudo, "apt-get", *arguments]
         try:
             subprocess.run(command, check=True, env=environment, stdout=sys.stderr)
         except (subprocess.CalledProcessError, OSError) as error:
-            raise RenderingUnavailable(f"`{' '.join(command)}` failed ({error}). Run by hand: {mending_line()}") from error
+            raise RenderingUnavailable(f"`{' '.join(command)}` failed ({error}). Run by hand:\n{mending_line()}") from error
 
 
 def may_install() -> bool:

@@ -58,4 +58,5 @@ class Consistency(AuxiliaryObjective):
         self.predictor.apply(init_orthogonal)
 
     def forward(self, views: Views) -> th.Tensor:
+        """:param views: the views of one batch; :return: the loss, a scalar"""
         return consistency_loss(self.predictor(views.positive.key_latent), views.anchor.latent, self.reduction)

@@ -42,4 +42,5 @@ class Contrastive(AuxiliaryObjective):
         return (self.weight + self.weight.T) / 2
 
     def forward(self, views: Views) -> th.Tensor:
+        """:param views: the views of one batch; :return: the loss, a scalar"""
         return info_nce(views.anchor.latent, views.positive.key_latent, self.bilinear)

@@ -58,10 +58,12 @@ class Reconstruction(AuxiliaryObjective):
 
     @classmethod
     def for_encoder(cls, encoder: PixelEncoder, action_dim: int, **own: Any) -> Self:
+        """Build it with a decoder that mirrors ``encoder``."""
         mirrored = {"channels": encoder.channels, "strides": encoder.strides, "kernel_size": encoder.kernel_size}
         return super().for_encoder(encoder, action_dim, **{**mirrored, **own})
 
     def forward(self, views: Views) -> th.Tensor:
+        """:param views: the views of one batch; :return: the loss, a scalar"""
         latent = views.anchor.latent
         loss = reconstruction_loss(self.decoder(latent), views.anchor.pixels)
         if self.latent_penalty > 0:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives import (
     OBJECTIVES,
     Consistency,
@@ -16,7 +17,6 @@ from sb3_crc.objectives import (
     info_nce,
     reconstruction_loss,
 )
-from sb3_crc.encoder import PixelEncoder
 from tests.test_encoder import image_space
 
 SHAPE = (3, 40, 40)

@@ -1,0 +1,69 @@
+# Thin: what is worth testing lives in the package. `make help` lists the targets.
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+
+PYTHON ?=                                   # an interpreter, 3.10 to 3.12; empty: the first suitable one
+ARGS ?=                                     # more flags for `make train` or pytest
+TRAIN_ARGS = --algo crc --env dmc_pixels/cartpole-swingup-v0 --conf-file zoo_configs/laptop.yml --progress \
+	--eval-freq 625 --eval-episodes 5 --verbose 0 -f logs -tb logs/tensorboard $(ARGS)
+TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
+# Two test processes share two cores: more threads each would only wait for one another.
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+STAMP := .venv/.installed-$(shell cat pyproject.toml constraints.txt | cksum | tr ' ' '-')
+
+.PHONY: help train test test-slow test-long lint constraints doctor clean install rendering
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
+	  printf '  make %-12s %s\n' "$$name" "$$text"; done
+
+train: rendering ## train CRC-RL on cartpole-swingup from pixels; more flags: make train ARGS="--seed 1"
+	@exec .venv/bin/python train.py $(TRAIN_ARGS)
+
+test: rendering ## the fast tests, a few minutes on two cores
+	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)
+
+test-slow: rendering ## the slow tests: real environments, real training runs
+	@.venv/bin/python -m pytest -m slow $(ARGS) || [ $$? -eq 5 ] # 5: there are none
+
+test-long: rendering ## the tests that take hours
+	@.venv/bin/python -m pytest -m long $(ARGS) || [ $$? -eq 5 ]
+
+lint: $(STAMP) ## style, types, import contracts, docstrings
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy --strict sb3_crc
+	.venv/bin/lint-imports
+	.venv/bin/interrogate sb3_crc
+
+constraints: $(STAMP) ## solve the exact versions anew
+	.venv/bin/uv pip compile --universal --python-version 3.10 --all-extras pyproject.toml \
+	  --custom-compile-command "make constraints" -o constraints.txt
+
+doctor: $(STAMP) ## show what works on this machine
+	@.venv/bin/python -m sb3_crc doctor
+
+clean: ## remove .venv, caches and build output; logs stay
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+install: $(STAMP) ## the virtual environment alone
+
+rendering: $(STAMP)
+	@.venv/bin/python -m sb3_crc rendering --install
+
+# The stamp's name holds a checksum of what was installed, and it is written last: an interrupted installation has none.
+# On Linux x86-64 without a GPU the PyTorch index saves about 3 GB of CUDA libraries, if it answers within 3 seconds.
+$(STAMP):
+	@rm -f .venv/.installed-*
+	@.venv/bin/python -m pip --version >/dev/null 2>&1 || { \
+	  for python in $(or $(strip $(PYTHON)),python3.12 python3.11 python3.10 python3); do \
+	    if "$$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' >/dev/null 2>&1; then \
+	      echo "making .venv with $$python"; exec "$$python" -m venv --clear .venv; fi; \
+	  done; echo "No Python 3.10 to 3.12 found: install one, or say make PYTHON=/path/to/python." >&2; exit 1; }
+	@index=; \
+	if [ "$$(uname -sm)" = "Linux x86_64" ] && ! nvidia-smi >/dev/null 2>&1 && timeout 3 .venv/bin/python -c \
+	  'from urllib.request import urlopen; urlopen("$(TORCH_CPU_INDEX)/torch/", timeout=3)' >/dev/null 2>&1; \
+	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
+	exec .venv/bin/python -m pip install --disable-pip-version-check $$index -c constraints.txt -e '.[zoo,video,analysis,dev]'
+	@touch $@

@@ -1,0 +1,137 @@
+"""The zoo with our algorithms, on real dm_control."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rl_zoo3
+import yaml
+
+from sb3_crc import CRCSAC, PRESETS
+from sb3_crc.zoo import CONFIGS, CRCExperimentManager, preset_class, register
+from tests.conftest import NoiseEnv, POLICY_KWARGS
+
+ROOT = Path(__file__).parent.parent
+ENV = "dmc_pixels/cartpole-swingup-v0"
+
+
+def command(folder: Path, *flags: str, algo: str = "crc") -> list[str]:
+    settings = ["--conf-file", str(ROOT / "tests" / "tiny.yml"), "-f", str(folder), "--seed", "1", "--device", "cpu"]
+    return [sys.executable, "train.py", "--algo", algo, "--env", ENV, *settings, *flags]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def test_train_py_trains_on_real_dm_control_and_leaves_its_results(tmp_path: Path) -> None:
+    flags = ["--eval-freq", "130", "--eval-episodes", "1", "--progress", "--verbose", "0", "-params", "gradient_steps:2"]
+    run = subprocess.run(command(tmp_path, *flags), cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+    folder = tmp_path / "crc" / "dmc_pixels-cartpole-swingup-v0_1"
+    final = folder / "dmc_pixels-cartpole-swingup-v0.zip"
+    for name in ("best_model.zip", "progress.csv", "learning_curve.png", "policy.mp4"):
+        assert (folder / name).stat().st_size > 100, name
+    assert list(folder.glob("events.out.tfevents.*"))
+    config = yaml.load((folder / "dmc_pixels-cartpole-swingup-v0" / "config.yml").read_text(), yaml.UnsafeLoader)
+    assert config["gradient_steps"] == 2
+    with np.load(folder / "evaluations.npz") as evaluations:
+        assert evaluations["ep_lengths"].tolist() == [[125]]  # decisions: 1000 environment steps at repeat 8
+    last_line = run.stdout.strip().splitlines()[-1]
+    assert last_line.startswith("Training finished. To go on: python train.py --algo crc")
+    assert f"-i {final}" in last_line
+
+    model = CRCSAC.load(final)
+    assert model._n_updates == 2 * 20
+    assert model.policy.key_encoder.input_shape == (6, 30, 30)
+
+
+@pytest.mark.slow
+def test_ctrl_c_writes_everything_and_says_how_to_go_on(tmp_path: Path) -> None:
+    flags = ["-n", "100000", "--eval-freq", "130", "--eval-episodes", "1", "--verbose", "0"]
+    run = subprocess.Popen(command(tmp_path, *flags), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
+    folder = tmp_path / "crc" / "dmc_pixels-cartpole-swingup-v0_1"
+    deadline = time.time() + 100
+    while not (folder / "best_model.zip").exists():
+        assert run.poll() is None and time.time() < deadline
+        time.sleep(0.2)
+    run.send_signal(signal.SIGINT)
+    output, _ = run.communicate(timeout=100)
+    assert run.returncode == 0
+    final = folder / "dmc_pixels-cartpole-swingup-v0.zip"
+    for path in (final, folder / "learning_curve.png", folder / "policy.mp4", folder / "progress.csv"):
+        assert path.stat().st_size > 100, path
+    last_line = output.strip().splitlines()[-1]
+    assert "stopped at" in last_line
+
+    # and the line is true
+    go_on = last_line.partition("To go on: python ")[2].split()
+    rest = ["-n", "130", "-f", str(tmp_path), "--eval-freq", "-1", "--seed", "2", "--verbose", "0"]
+    resumed = subprocess.run([sys.executable, *go_on[:-2], *rest], cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert resumed.returncode == 0, resumed.stderr[-2000:]
+    assert "Loading pretrained agent" in resumed.stdout
+    before = CRCSAC.load(final)._n_updates
+    assert CRCSAC.load(tmp_path / "crc" / "dmc_pixels-cartpole-swingup-v0_2" / final.name)._n_updates == before + 10
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_algorithms_whose_zips_are_crcsacs(preset: str, tmp_path: Path) -> None:
+    register()
+    algorithm = rl_zoo3.ALGOS[preset]
+    assert issubclass(algorithm, CRCSAC)
+    small = {"buffer_size": 50, "batch_size": 8, "policy_kwargs": POLICY_KWARGS}
+    model = algorithm("CnnPolicy", NoiseEnv(), **small)
+    for name, value in {**PRESETS[preset], **small}.items():
+        assert getattr(model, name) == value
+    model.save(tmp_path / "model.zip")
+    for loaded in (CRCSAC.load(tmp_path / "model.zip"), algorithm.load(tmp_path / "model.zip")):
+        assert loaded.objectives == model.objectives
+        assert loaded.policy.state_dict().keys() == model.policy.state_dict().keys()
+
+
+def test_arguments_win_over_the_preset() -> None:
+    model = preset_class("rad")("CnnPolicy", NoiseEnv(), objectives={"contrastive": 1.0}, buffer_size=50)
+    assert model.objectives == {"contrastive": 1.0}
+    assert model.augmentation == "random_crop"
+
+
+def test_yaml_env_kwargs_reach_the_evaluation_environment(tmp_path: Path) -> None:
+    """rl_zoo3 2.9.2 passes them to the training environment only."""
+    register()
+    from argparse import Namespace
+
+    config = str(ROOT / "tests" / "tiny.yml")
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), eval_freq=10, config=config, verbose=0)
+    model, _ = manager.setup_experiment()
+    try:
+        evaluation = manager.create_envs(1, eval_env=True)
+        assert evaluation.observation_space == model.observation_space
+        assert evaluation.observation_space.shape == (6, 36, 36)
+        evaluation.close()
+    finally:
+        model.env.close()
+
+
+def test_every_configuration_names_only_arguments_that_exist() -> None:
+    """Unknown keys would fail only when somebody trains with them."""
+    import inspect
+
+    from stable_baselines3 import SAC
+
+    known = set(inspect.signature(CRCSAC.__init__).parameters) | set(inspect.signature(SAC.__init__).parameters)
+    zoo_keys = {"n_timesteps", "env_kwargs", "n_envs"}
+    for path in CONFIGS.glob("*.yml"):
+        for env_id, settings in yaml.safe_load(path.read_text()).items():
+            assert set(settings) <= known | zoo_keys, (path, env_id)
+
+
+def test_crc_yml_is_the_preset() -> None:
+    settings = yaml.safe_load((CONFIGS / "crc.yml").read_text())[ENV]
+    for name, value in PRESETS["crc"].items():
+        assert settings[name] == value, name
+    assert settings["n_timesteps"] * settings["env_kwargs"]["action_repeat"] == 100_000
