@@ -110,7 +110,7 @@ def register() -> None:
 
 def train() -> None:
     """Run rl_zoo3's training script, with every flag it has, on our algorithms and environments."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    logging.basicConfig(format="%(message)s")
     register()
     try:
         rl_zoo3.train.train()
