@@ -5,7 +5,7 @@ SHELL := /bin/sh
 PYTHON ?=                                   # an interpreter, 3.10 to 3.12; empty: the first suitable one
 ARGS ?=                                     # more flags for `make train` or pytest
 TRAIN_ARGS = --algo crc --env dmc_pixels/cartpole-swingup-v0 --conf-file zoo_configs/laptop.yml --progress \
-	--eval-freq 625 --eval-episodes 5 --verbose 0 -f logs -tb logs/tensorboard $(ARGS)
+	--eval-freq 625 --eval-episodes 5 --verbose 0 -f logs $(ARGS)
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 # Two test processes share two cores: more threads each would only wait for one another.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
@@ -57,7 +57,7 @@ rendering: $(STAMP)
 $(STAMP):
 	@rm -f .venv/.installed-*
 	@.venv/bin/python -m pip --version >/dev/null 2>&1 || { \
-	  for python in $(or $(strip $(PYTHON)),python3.12 python3.11 python3.10 python3); do \
+	  for python in $(or $(strip $(PYTHON)),python3 python3.12 python3.11 python3.10); do \
 	    if "$$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' >/dev/null 2>&1; then \
 	      echo "making .venv with $$python"; exec "$$python" -m venv --clear .venv; fi; \
 	  done; echo "No Python 3.10 to 3.12 found: install one, or say make PYTHON=/path/to/python." >&2; exit 1; }

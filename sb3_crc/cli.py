@@ -1,7 +1,9 @@
-"""The command line: ``python -m sb3_crc doctor`` and ``python -m sb3_crc rendering``."""
+"""The command line, ``python -m sb3_crc``: what works here, and small measurements. Training is ``train.py``."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -19,12 +21,12 @@ MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "broken": "[red]broken
 @app.command()
 def doctor() -> None:
     """Show what works on this machine; exit code 1 if something essential does not."""
-    from sb3_crc.doctor import examine
+    from sb3_crc.doctor import Finding, examine
 
     table = Table(title="sb3_crc doctor", title_justify="left")
     for column in ("", "", "found", ""):
         table.add_column(column, overflow="fold")
-    findings = []
+    findings: list[Finding] = []
     with console.status("drawing a few frames"):
         for finding in examine():
             begins = not findings or findings[-1].topic != finding.topic
@@ -34,7 +36,10 @@ def doctor() -> None:
             table.add_row(topic, finding.name, escape(finding.value), MARKS[finding.verdict])
             findings.append(finding)
     console.print(table)
-    if any(finding.verdict == "broken" for finding in findings):
+    broken = [finding for finding in findings if finding.verdict == "broken"]
+    for finding in broken:  # once more outside the table, where a command that is to be copied stays on one line
+        errors.print(escape(f"{finding.name}: {finding.value}"), soft_wrap=True, highlight=False)
+    if broken:
         raise typer.Exit(1)
 
 
@@ -62,3 +67,38 @@ def rendering(
         raise typer.Exit(2) from None
     line = f"pictures are drawn by {outcome.backend}: {outcome.renderer}"
     console.print(escape(line), soft_wrap=True, highlight=False)
+
+
+@app.command()
+def baselines(
+    task: Annotated[str, typer.Argument(help="domain-task, for instance cartpole-swingup")],
+    output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
+    episodes: Annotated[int, typer.Option(min=2, help="of each policy")] = 20,
+    action_repeat: Annotated[int | None, typer.Option(min=1, help="the task's own if not given")] = None,
+    seed: int = 0,
+) -> None:
+    """Measure the returns of the random and of the zero policy."""
+    from sb3_crc.experiments.baselines import measure_baselines
+
+    measured = measure_baselines(task, episodes=episodes, action_repeat=action_repeat, seed=seed)
+    if output is None:
+        console.print_json(data=measured)
+    else:
+        output.write_text(json.dumps(measured, indent=2) + "\n")
+
+
+@app.command()
+def curve(
+    run: Annotated[Path, typer.Argument(help="folder of a run, with its evaluations.npz")],
+    output: Annotated[Path, typer.Option(help="picture to write")] = Path("learning_curve.png"),
+    action_repeat: Annotated[int, typer.Option(min=1, help="environment steps per agent step of that run")] = 1,
+    baselines: Annotated[Path | None, typer.Option(help="JSON of `baselines`, drawn as lines")] = None,
+    title: str = "",
+) -> None:
+    """Draw the learning curve of a run, beside policies that have learned nothing."""
+    from sb3_crc.experiments.curves import plot_learning_curve
+
+    measured = {} if baselines is None else json.loads(baselines.read_text())
+    references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
+    evaluations = run / "evaluations.npz"
+    plot_learning_curve(evaluations, output, action_repeat=action_repeat, title=title, references=references)

@@ -27,8 +27,8 @@ GIGABYTE = 1e9  # decimal, as in the papers' and SB3's figures
 
 FULL_BUFFER = (100_000, (9, 100, 100))
 """The paper's buffer: transitions, and the bytes of one observation."""
-LAPTOP_BUFFER = (12_500, (9, 64, 64))
-"""100 000 environment steps of cartpole at action repeat 8, as zoo_configs/laptop.yml stores them."""
+LAPTOP_BUFFER = (15_000, (9, 64, 64))
+"""The buffer of zoo_configs/laptop.yml."""
 
 
 @dataclass(frozen=True)

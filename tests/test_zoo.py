@@ -14,7 +14,7 @@ import yaml
 
 from sb3_crc import CRCSAC, PRESETS
 from sb3_crc.zoo import CONFIGS, CRCExperimentManager, preset_class, register
-from tests.conftest import NoiseEnv, POLICY_KWARGS
+from tests.conftest import POLICY_KWARGS, NoiseEnv
 
 ROOT = Path(__file__).parent.parent
 ENV = "dmc_pixels/cartpole-swingup-v0"

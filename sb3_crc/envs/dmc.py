@@ -1,7 +1,8 @@
 """dm_control suite tasks for Stable-Baselines3: byte pictures, channel first, one rendering per decision.
 
-The chain, inside out: dm_control -> Shimmy -> :class:`SimulatorStep` -> (RescaleAction) -> RepeatAction -> AddRenderObservation
--> :class:`PixelStack`. The picture is taken outside the repeat: rendering is by far the dearest part of a simulator step.
+The chain, inside out: dm_control -> Shimmy -> :class:`SimulatorStep` -> (RescaleAction) -> RepeatAction ->
+AddRenderObservation -> :class:`PixelStack`. The picture is taken outside the repeat: rendering is by far the dearest part of
+a simulator step.
 
 Dimensions: C channels, S picture side (pixels), k stacked frames, A action.
 """
@@ -202,7 +203,7 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1.0 / (control_timestep * action_repeat)}
 
     @property
-    def render_mode(self) -> str | None:
+    def render_mode(self) -> str | None:  # type: ignore[override]  # gymnasium's Env has it as an attribute
         """What ``render()`` returns: "rgb_array", or None for nothing."""
         return self._render_mode
 

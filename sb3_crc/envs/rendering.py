@@ -115,7 +115,7 @@ def select_backend() -> str:
         raise RenderingUnavailable(f"MUJOCO_GL={asked} needs a display: unset it, or set it to egl or osmesa.")
     loaded = sys.modules.get("dm_control._render")
     bound = getattr(loaded, "BACKEND", None)
-    if bound and (bound != "glfw" or "glfw" in candidates()):
+    if bound and bound not in DISABLED and (bound != "glfw" or "glfw" in candidates()):
         return str(bound)
     backend = asked or _first_that_draws().backend
     os.environ["MUJOCO_GL"] = backend
@@ -164,7 +164,7 @@ def mending_line() -> str:
     if platform.system() == "Linux":
         return "install EGL and Mesa's software driver (Fedora: dnf install mesa-libEGL mesa-dri-drivers)"
     if platform.system() == "Darwin":
-        return "run in a session with a screen: macOS draws through GLFW, which needs one"
+        return "log in at the screen: macOS draws through GLFW, which needs one"
     return "use Linux, or WSL2 on Windows"
 
 
@@ -204,7 +204,7 @@ def _is_root() -> bool:
 
 
 def _in_container() -> bool:
-    if Path("/.dockerenv").exists() or Path("/run/.containerenv").exists() or os.environ.get("container"):
+    if Path("/.dockerenv").exists() or Path("/run/.containerenv").exists() or "container" in os.environ:
         return True
     with contextlib.suppress(OSError):
         control_groups = Path("/proc/1/cgroup").read_text(encoding="utf-8")

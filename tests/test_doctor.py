@@ -1,0 +1,111 @@
+"""The doctor's findings, and the exit codes of the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from stable_baselines3.common.buffers import ReplayBuffer
+from typer.testing import CliRunner
+
+from sb3_crc import doctor
+from sb3_crc.cli import app
+from sb3_crc.doctor import available_memory, examine, examine_memory, replay_buffer_bytes
+from sb3_crc.envs import rendering
+from sb3_crc.envs.rendering import RenderingUnavailable
+
+
+def test_every_topic_is_looked_at() -> None:
+    findings = list(examine())
+    assert {finding.topic for finding in findings} == {"versions", "rendering", "compute", "memory"}
+    broken = [finding for finding in findings if finding.verdict == "broken"]
+    assert broken == []
+    by_name = {finding.name: finding.value for finding in findings}
+    assert by_name["mujoco"].startswith("3.")
+    for name in ("benchmark, 100 px", "fast, 64 px"):
+        assert 0 < float(by_name[name].split(" ms")[0]) < 1000
+
+
+def test_buffer_formula_is_what_sb3_allocates() -> None:
+    buffer = ReplayBuffer(50, Box(0, 255, (9, 20, 20), np.uint8), Box(-1, 1, (1,)), device="cpu")
+    assert replay_buffer_bytes(50, (9, 20, 20)) == buffer.observations.nbytes + buffer.next_observations.nbytes
+    assert replay_buffer_bytes(100_000, (9, 100, 100)) == 18_000_000_000
+
+
+def test_a_buffer_that_does_not_fit_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "available_memory", lambda: 2_000_000_000)
+    findings = {finding.name: finding for finding in examine_memory()}
+    assert findings["paper's buffer"].verdict == "note" and "does not fit" in findings["paper's buffer"].value
+    assert findings["laptop buffer"].verdict == "ok"
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="ascii")
+
+
+def test_a_containers_limit_counts(tmp_path: Path) -> None:
+    unlimited = available_memory(tmp_path / "none")
+    assert unlimited > 0
+    write(tmp_path / "v2/memory.max", "50000000\n")
+    write(tmp_path / "v2/memory.current", "30000000\n")
+    write(tmp_path / "v2/memory.stat", "anon 1\ninactive_file 4000000\n")
+    assert available_memory(tmp_path / "v2") == 24_000_000
+    write(tmp_path / "v1/memory/memory.limit_in_bytes", "50000000\n")
+    write(tmp_path / "v1/memory/memory.usage_in_bytes", "30000000\n")
+    assert available_memory(tmp_path / "v1") == 20_000_000
+    write(tmp_path / "v2/memory.max", "max\n")
+    assert available_memory(tmp_path / "v2") > 50_000_000
+
+
+def test_a_missing_package_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "REQUIRED_PACKAGES", ("no-such-package",))
+    monkeypatch.setattr(doctor, "OPTIONAL_PACKAGES", ("no-such-extra",))
+    verdicts = {finding.name: finding.verdict for finding in doctor.examine_versions()}
+    assert (verdicts["no-such-package"], verdicts["no-such-extra"]) == ("broken", "note")
+
+
+def test_doctor_command_fails_without_a_back_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unavailable() -> None:
+        raise RenderingUnavailable("nothing draws: apt-get [x]")
+
+    monkeypatch.setattr(doctor, "prove_backend", unavailable)
+    outcome = CliRunner().invoke(app, ["doctor"])
+    assert outcome.exit_code == 1
+    assert "nothing draws" in outcome.output and "broken" in outcome.output and "available" in outcome.output
+
+
+def test_rendering_command_prints_the_choice() -> None:
+    outcome = CliRunner().invoke(app, ["rendering"])
+    assert outcome.exit_code == 0
+    assert "pictures are drawn by" in outcome.output
+
+
+def test_rendering_command_stops_with_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unavailable() -> None:
+        raise RenderingUnavailable("nothing draws")
+
+    monkeypatch.setattr(rendering, "prove_backend", unavailable)
+    monkeypatch.setattr(rendering, "may_install", lambda: False)
+    monkeypatch.setattr(rendering.shutil, "which", lambda name: f"/usr/bin/{name}")
+    assert CliRunner().invoke(app, ["rendering"]).exit_code == 2
+    outcome = CliRunner().invoke(app, ["rendering", "--install"])
+    assert outcome.exit_code == 2
+    line = outcome.output.strip().splitlines()[-1]
+    assert line.endswith("apt-get install -y libegl1 libopengl0 libgl1-mesa-dri")  # whole, however long
+
+
+def test_rendering_command_installs_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed: list[bool] = []
+
+    def prove() -> rendering.Probe:
+        if not installed:
+            raise RenderingUnavailable("nothing draws")
+        return rendering.Probe("egl", "Mesa", 1.0)
+
+    monkeypatch.setattr(rendering, "prove_backend", prove)
+    monkeypatch.setattr(rendering, "install_system_library", lambda: installed.append(True))
+    outcome = CliRunner().invoke(app, ["rendering", "--install"])
+    assert outcome.exit_code == 0 and "egl: Mesa" in outcome.output
