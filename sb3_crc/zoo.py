@@ -92,7 +92,7 @@ class CRCExperimentManager(ExperimentManager):
         zip_file = Path(self.save_path) / f"{self.env_name}.zip"
         more = self.n_timesteps - done if done < self.n_timesteps else self.n_timesteps
         state = "finished" if done >= self.n_timesteps else f"stopped at {done} of {self.n_timesteps} agent steps"
-        command = f"python train.py --algo {self.algo} --env {self.env_name.gym_id} --conf-file {self.config}"
+        command = f"{sys.orig_argv[0]} train.py --algo {self.algo} --env {self.env_name.gym_id} --conf-file {self.config}"
         return f"Training {state}. To go on: {command} -i {zip_file} -n {more}"
 
 

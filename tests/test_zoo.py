@@ -43,7 +43,7 @@ def test_train_py_trains_on_real_dm_control_and_leaves_its_results(tmp_path: Pat
     with np.load(folder / "evaluations.npz") as evaluations:
         assert evaluations["ep_lengths"].tolist() == [[125]]  # decisions: 1000 environment steps at repeat 8
     last_line = run.stdout.strip().splitlines()[-1]
-    assert last_line.startswith("Training finished. To go on: python train.py --algo crc")
+    assert last_line.startswith(f"Training finished. To go on: {sys.executable} train.py --algo crc")
     assert f"-i {final}" in last_line
 
     model = CRCSAC.load(final)
@@ -70,9 +70,9 @@ def test_ctrl_c_writes_everything_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert "stopped at" in last_line
 
     # and the line is true
-    go_on = last_line.partition("To go on: python ")[2].split()
+    go_on = last_line.partition("To go on: ")[2].split()
     rest = ["-n", "130", "-f", str(tmp_path), "--eval-freq", "-1", "--seed", "2", "--verbose", "0"]
-    resumed = subprocess.run([sys.executable, *go_on[:-2], *rest], cwd=ROOT, env=environment(), capture_output=True, text=True)
+    resumed = subprocess.run([*go_on[:-2], *rest], cwd=ROOT, env=environment(), capture_output=True, text=True)
     assert resumed.returncode == 0, resumed.stderr[-2000:]
     assert "Loading pretrained agent" in resumed.stdout
     before = CRCSAC.load(final)._n_updates
