@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder
@@ -11,6 +12,16 @@ from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
 
 __version__ = version("sb3-crc")
-__all__ = ["CRCSAC", "PRESETS", "CRCPolicy", "PixelDecoder", "PixelEncoder", "make_dmc"]
+__all__ = [
+    "CRCSAC",
+    "PRESETS",
+    "AuxiliaryLossCallback",
+    "CRCPolicy",
+    "ObjectiveScheduleCallback",
+    "PixelDecoder",
+    "PixelEncoder",
+    "ReconstructionImageCallback",
+    "make_dmc",
+]
 
 register_environments()

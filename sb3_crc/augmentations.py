@@ -4,27 +4,32 @@ B batch, C channels (of the whole frame stack), H, W height and width. One offse
 stack, from torch's global CPU generator, whatever the device; every offset is possible, both ends included.
 """
 
+import inspect
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 
+import numpy as np
 import torch as th
 from torch.nn import functional as F
 
 ImageSize = int | tuple[int, int]
 
 
-def random_crop(images: th.Tensor, size: ImageSize) -> th.Tensor:
+def random_crop(images: th.Tensor, size: ImageSize, *, last_offset: bool = True) -> th.Tensor:
     """
     Cut a window at a random place out of each sample (RAD, arXiv 2004.14990; CURL, arXiv 2004.04136).
 
     :param images: uint8 ``(B, C, H, W)``
     :param size: height and width of the window in pixels, or one number for both
+    :param last_offset: False: the window never touches the lower and right border (the released code of CRC-RL)
     :return: uint8 ``(B, C, *size)``
     :raises ValueError: if the window is larger than the images
     """
     height, width = checked_size(images, size)
     batch, _, rows, columns = images.shape
-    tops = th.randint(rows - height + 1, (batch,)).tolist()
-    lefts = th.randint(columns - width + 1, (batch,)).tolist()
+    tops = th.randint(max(1, rows - height + last_offset), (batch,)).tolist()
+    lefts = th.randint(max(1, columns - width + last_offset), (batch,)).tolist()
     # Slices copy whole rows: four times faster on CPU than one advanced index, and offsets on the host need no device sync
     corners = zip(images.unbind(), tops, lefts, strict=True)
     return th.stack([image[:, top : top + height, left : left + width] for image, top, left in corners])
@@ -59,6 +64,60 @@ def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
     return random_crop(F.pad(images, (pad, pad, pad, pad), mode="replicate"), (height, width))
 
 
+def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None = None) -> th.Tensor:
+    """
+    Blend each sample with a random picture, the same for its whole stack (SODA, arXiv 2011.13389).
+
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param alpha: share of the picture, in [0, 1]
+    :param source: a folder of pictures, for instance of Places365, of which at most 1 000 are read; None: 64 pictures of
+        smooth random colours, always the same
+    :return: uint8 ``(B, C, H, W)``
+    :raises ValueError: for an alpha outside [0, 1], stacks that are not RGB, or a folder without pictures
+    """
+    if not 0 <= alpha <= 1:
+        raise ValueError(f"random_overlay: alpha={alpha} must be within [0, 1]")
+    batch, channels, height, width = images.shape
+    if channels % 3 != 0:
+        raise ValueError(f"random_overlay: needs stacks of RGB frames, got {channels} channels")
+    pictures = _pictures(source, (height, width)).to(images.device)
+    chosen = pictures[th.randint(len(pictures), (batch,)).to(images.device)].repeat(1, channels // 3, 1, 1)
+    return th.lerp(images.float(), chosen.float(), alpha).round_().to(th.uint8)
+
+
+def random_crop_overlay(
+    images: th.Tensor, size: ImageSize, *, last_offset: bool = True, alpha: float = 0.5, source: str | None = None
+) -> th.Tensor:
+    """
+    :func:`random_crop`, then :func:`random_overlay` (the released code of CRC-RL).
+
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param size: as for :func:`random_crop`
+    :param last_offset: as for :func:`random_crop`
+    :param alpha: as for :func:`random_overlay`
+    :param source: as for :func:`random_overlay`
+    :return: uint8 ``(B, C, *size)``
+    """
+    return random_overlay(random_crop(images, size, last_offset=last_offset), alpha=alpha, source=source)
+
+
+@lru_cache(maxsize=4)
+def _pictures(source: str | None, size: tuple[int, int]) -> th.Tensor:
+    """:return: uint8 ``(pictures, 3, *size)``"""
+    if source is None:
+        coarse = th.rand(64, 3, 6, 6, generator=th.Generator().manual_seed(0))
+        smooth = F.interpolate(coarse, size, mode="bicubic", align_corners=False)
+        return (255 * smooth.clamp(0, 1)).to(th.uint8)
+    endings = (".jpg", ".jpeg", ".png", ".webp")
+    files = sorted(path for path in Path(source).rglob("*") if path.suffix.lower() in endings)[:1_000]
+    if not files:
+        raise ValueError(f"random_overlay: no pictures ({', '.join(endings)}) in {source!r}")
+    from PIL import Image
+
+    pictures = [np.asarray(Image.open(file).convert("RGB").resize(size[::-1])) for file in files]
+    return th.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).contiguous()
+
+
 def checked_size(images: th.Tensor, size: ImageSize) -> tuple[int, int]:
     """:return: ``size`` as height and width; :raises ValueError: if it is not within the images."""
     height, width = (size, size) if isinstance(size, int) else size
@@ -72,4 +131,11 @@ AUGMENTATIONS: dict[str, Callable[..., th.Tensor]] = {
     "random_crop": random_crop,
     "center_crop": center_crop,
     "random_shift": random_shift,
+    "random_overlay": random_overlay,
+    "random_crop_overlay": random_crop_overlay,
 }
+
+
+def takes_size(augmentation: str) -> bool:
+    """Whether the augmentation of this name cuts its output to a ``size``."""
+    return "size" in inspect.signature(AUGMENTATIONS[augmentation]).parameters

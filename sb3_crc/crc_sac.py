@@ -4,34 +4,36 @@ B batch, Z latent, A action.
 """
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import (
-    FloatSchedule,
-    LinearSchedule,
-    polyak_update,
-    update_learning_rate,
-)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.sac.sac import SAC
 from typing_extensions import Self
 
-from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, center_crop
+from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, center_crop, takes_size
 from sb3_crc.encoder import image_shape
+from sb3_crc.instruments import CollapseAlarm, Speedometer, latent_health, update_ratio
 from sb3_crc.objectives import ObjectiveSettings, objective_weights
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
 from sb3_crc.presets import PRESETS
+from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
+from sb3_crc.schedules import LearningRate, lr_schedule, set_learning_rate
 from sb3_crc.views import Views
-
-LearningRate = float | str | Schedule
 
 #: Side of the network's input over that of the frame, where crops are cut: 84 of 100 pixels (RAD, CURL, CRC-RL).
 CROP_RATIO = 0.84
+#: Updates between two looks at the latent's health
+HEALTH_INTERVAL = 100
+
+ANCHORS = ("augmented", "center_crop")
+BALANCES = ("none", "grad_norm")
 
 
 class CRCSAC(SAC):
@@ -58,8 +60,16 @@ class CRCSAC(SAC):
     :param objectives: name -> weight, or name -> ``{"weight": w, **settings}``; ``{}``: no auxiliary losses
     :param augmentation: name in :data:`~sb3_crc.augmentations.AUGMENTATIONS`
     :param augmentation_kwargs: its arguments
-    :param image_size: side of the network's input in pixels, or (height, width); None: 84 % of the frame for the two crops,
+    :param image_size: side of the network's input in pixels, or (height, width); None: 84 % of the frame for crops,
         the whole frame for other augmentations
+    :param anchor: ``"augmented"``, or ``"center_crop"``: critic, actor, query, s and decoder see the middle of the frame (the
+        literal reading of the paper's consistency section; an ablation)
+    :param balance: ``"grad_norm"`` divides each objective by a moving average of its gradient norm at the latent before
+        weighting; ``"none"`` does not
+    :param joint_update: one pass through the encoder and one optimizer for the sum of critic loss and objectives: faster, but
+        here absolute weights matter, and a critic loss that grows with Q can swamp the objectives
+    :param reencode: step the critic first, then encode the anchor anew for objectives and actor (CURL, the released code of
+        CRC-RL); slower
     :param initial_updates: extra updates, made once, with the first ones
     :param reward_scale: factor on the rewards of sampled transitions
     :param max_grad_norm: clip each optimizer's gradient to this norm; None: never
@@ -93,6 +103,10 @@ class CRCSAC(SAC):
         augmentation: str = "random_crop",
         augmentation_kwargs: Mapping[str, Any] | None = None,
         image_size: ImageSize | None = None,
+        anchor: str = "augmented",
+        balance: str = "none",
+        joint_update: bool = False,
+        reencode: bool = False,
         initial_updates: int = 0,
         reward_scale: float = 1.0,
         max_grad_norm: float | None = None,
@@ -124,6 +138,10 @@ class CRCSAC(SAC):
         self.augmentation = augmentation
         self.augmentation_kwargs = augmentation_kwargs
         self.image_size = image_size
+        self.anchor = anchor
+        self.balance = balance
+        self.joint_update = joint_update
+        self.reencode = reencode
         self.initial_updates = initial_updates
         self.reward_scale = reward_scale
         self.max_grad_norm = max_grad_norm
@@ -137,11 +155,13 @@ class CRCSAC(SAC):
         if self.use_sde or self.optimize_memory_usage:
             refused = "use_sde" if self.use_sde else "optimize_memory_usage"
             raise ValueError(f"{refused}=True is not supported by {type(self).__name__}")
-        if self.augmentation not in AUGMENTATIONS:
-            nearest = difflib.get_close_matches(str(self.augmentation), AUGMENTATIONS, n=1, cutoff=0)
-            raise ValueError(
-                f"unknown augmentation {self.augmentation!r}; did you mean {nearest[0]!r}? Known: {', '.join(AUGMENTATIONS)}"
-            )
+        for name, known in (("augmentation", tuple(AUGMENTATIONS)), ("anchor", ANCHORS), ("balance", BALANCES)):
+            value = getattr(self, name)
+            if value not in known:
+                nearest = difflib.get_close_matches(str(value), known, n=1, cutoff=0)[0]
+                raise ValueError(f"unknown {name} {value!r}; did you mean {nearest!r}? Known: {', '.join(known)}")
+        if self.joint_update and self.reencode:
+            raise ValueError("joint_update and reencode exclude each other: one encoding for both gradients, or one for each")
         self._objective_weights = objective_weights(self.objectives)
 
         own_policy_kwargs = self.policy_kwargs
@@ -151,14 +171,16 @@ class CRCSAC(SAC):
             **own_policy_kwargs,
             "features_extractor_kwargs": encoder_kwargs,
             "objectives": self.objectives,
+            "joint_update": self.joint_update,
             "qf_lr_schedule": self._lr_schedules["qf_learning_rate"],
             "encoder_lr_schedule": self._lr_schedules["encoder_learning_rate"],
         }
         super()._setup_model()
         self.policy_kwargs = own_policy_kwargs
 
+        self._collapse_alarm, self._speedometer = CollapseAlarm(), Speedometer()
         size = self.policy.critic.features_extractor.input_shape[1:]
-        augmentation_kwargs = {"size": size} if self.augmentation.endswith("_crop") else {}
+        augmentation_kwargs = {"size": size} if takes_size(self.augmentation) else {}
         augmentation_kwargs.update(self.augmentation_kwargs or {})
         self._augmentation = partial(AUGMENTATIONS[self.augmentation], **augmentation_kwargs)
         if self.log_ent_coef is not None:
@@ -168,7 +190,7 @@ class CRCSAC(SAC):
         if self.image_size is not None:
             return self.image_size
         _, height, width = image_shape(self.observation_space)
-        ratio = CROP_RATIO if self.augmentation.endswith("_crop") else 1
+        ratio = CROP_RATIO if takes_size(self.augmentation) else 1
         return round(ratio * height), round(ratio * width)
 
     def _setup_lr_schedule(self) -> None:
@@ -204,7 +226,8 @@ class CRCSAC(SAC):
         for _ in range(gradient_steps):
             self._n_updates += 1
             views = self._sample_views(batch_size)
-            metrics = self._update_critic_and_encoder(views)
+            with self._instruments(views) as metrics:
+                metrics |= self._update_critic_and_encoder(views)
             if self._n_updates % self.policy_delay == 0:
                 metrics |= self._update_actor_and_temperature(views)
             if self._n_updates % self.target_update_interval == 0:
@@ -216,29 +239,59 @@ class CRCSAC(SAC):
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
         batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-        encoders = self.critic.features_extractor, self.policy.key_encoder
-        return Views(batch, self._augment, *encoders, gamma=self.gamma, reward_scale=self.reward_scale)
+        return Views(
+            batch,
+            self._augment,
+            self.critic.features_extractor,
+            self.policy.key_encoder,
+            gamma=self.gamma,
+            reward_scale=self.reward_scale,
+            augment_anchor=self.anchor == "augmented",
+        )
 
     def _augment(self, images: th.Tensor) -> th.Tensor:
         return center_crop(self._augmentation(images), self.critic.features_extractor.input_shape[1:])
 
     def _update_critic_and_encoder(self, views: Views) -> dict[str, th.Tensor]:
-        """Both gradients are taken at the same weights, from one encoding of the anchor; then each Adam steps on its own."""
-        critic, optimizer = self.critic, self.policy.encoder_optimizer
-        critic_loss = self._critic_loss(views)
-        losses = {name: objective(views) for name, objective in self.policy.objectives.items()}
-        metrics = {"train/critic_loss": critic_loss}
+        """
+        Train encoder, Q heads and objectives on the anchor's one encoding.
 
-        critic_parameters = _parameters(critic.optimizer)
-        critic_gradients = th.autograd.grad(critic_loss, critic_parameters, retain_graph=bool(losses))
-        if optimizer is not None:
-            loss = th.stack([self._objective_weights[name] * value for name, value in losses.items()]).sum()
-            gradients = th.autograd.grad(loss, _parameters(optimizer), allow_unused=True)
-            self._step(optimizer, gradients)
-            metrics |= {f"representation/{name}": value for name, value in losses.items()}
-            metrics["representation/loss"] = loss
-        self._step(critic.optimizer, critic_gradients)
-        return metrics
+        By default both gradients are taken at the same weights, and then each Adam steps on its own. ``joint_update`` sums
+        them at the latent for one pass through the encoder and one Adam; ``reencode`` steps the critic before the objectives
+        look.
+        """
+        anchor, encoder = views.anchor, list(self.critic.features_extractor.parameters())
+        critic_loss = self._critic_loss(views)
+        td_gradient, *head_gradients = th.autograd.grad(critic_loss, [anchor.latent, *self.critic.head_parameters()])
+        metrics = {"train/critic_loss": critic_loss}
+        optimizer = self.policy.encoder_optimizer
+        if optimizer is None:
+            self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
+            return metrics
+
+        if self.reencode:
+            self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
+            anchor.forget_encoding()
+        auxiliary = self._auxiliary_gradients(views, td_gradient)
+        if self.joint_update:
+            total = auxiliary.plus(td_gradient)
+            self._step(self.critic.optimizer, [*anchor.backward(total, encoder), *head_gradients])
+            self._step(optimizer, auxiliary.own)
+        else:
+            if not self.reencode:
+                critic_gradients = anchor.backward((td_gradient, None), encoder, retain_graph=True)
+            encoder_gradients = anchor.backward(auxiliary.leaves, encoder)
+            if not self.reencode:
+                self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
+            self._step(optimizer, [*encoder_gradients, *auxiliary.own])
+        if self.reencode:
+            anchor.forget_encoding()
+        return metrics | auxiliary.metrics
+
+    def _auxiliary_gradients(self, views: Views, td_gradient: th.Tensor) -> AuxiliaryGradients:
+        policy, balance = self.policy, self.balance == "grad_norm"
+        weights = self._objective_weights
+        return auxiliary_gradients(policy.objectives, weights, views, td_gradient, policy.gradient_norms, balance=balance)
 
     def _critic_loss(self, views: Views) -> th.Tensor:
         """Twin soft Q loss, 0.5 * sum over the heads of the mean squared Bellman error."""
@@ -269,13 +322,14 @@ class CRCSAC(SAC):
         polyak_update(critic.head_parameters(), target.head_parameters(), self.tau)
         encoder, key_encoder = critic.features_extractor, self.policy.key_encoder
         polyak_update(encoder.parameters(), key_encoder.parameters(), self.encoder_tau)
-        polyak_update(critic.buffers(), target.buffers(), 1.0)
+        for buffer, target_buffer in zip(critic.buffers(), target.buffers(), strict=True):
+            target_buffer.copy_(buffer)
 
     def _temperature(self) -> th.Tensor:
         """The entropy coefficient, shape ``(1,)`` or ``()``, without gradient."""
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
 
-    def _step(self, optimizer: th.optim.Optimizer, gradients: tuple[th.Tensor | None, ...]) -> None:
+    def _step(self, optimizer: th.optim.Optimizer, gradients: Sequence[th.Tensor | None]) -> None:
         parameters = _parameters(optimizer)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -296,14 +350,29 @@ class CRCSAC(SAC):
         for name, optimizer in optimizers.items():
             if optimizer is not None:
                 value = self._lr_schedules[name](self._current_progress_remaining)
-                update_learning_rate(optimizer, value)
+                set_learning_rate(optimizer, value)
                 self.logger.record(f"train/{name}", value)
+
+    @contextmanager
+    def _instruments(self, views: Views) -> Iterator[dict[str, th.Tensor]]:
+        """Once in a while, look at the latent, and at how far encoder and Q heads move."""
+        metrics: dict[str, th.Tensor] = {}
+        looks = self._n_updates % HEALTH_INTERVAL == 0
+        parts = {"encoder": list(self.critic.features_extractor.parameters()), "q_heads": self.critic.head_parameters()}
+        if looks:
+            metrics = latent_health(views.anchor.latent.detach(), views.anchor.features.detach())
+            before = {name: [parameter.detach().clone() for parameter in part] for name, part in parts.items()}
+        yield metrics
+        if looks:
+            metrics |= {f"train/{name}_update_ratio": update_ratio(before[name], part) for name, part in parts.items()}
 
     def _record(self, records: dict[str, list[th.Tensor]]) -> None:
         """Log the means over one call of :meth:`train`, with a single transfer from the device."""
         means = th.stack([th.stack([value.detach().reshape(()) for value in values]).mean() for values in records.values()])
         for name, mean in zip(records, means.tolist(), strict=True):
             self.logger.record(name, mean)
+            if name == "representation/latent_std":
+                self._collapse_alarm.check(mean, HEALTH_INTERVAL * len(records[name]))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
@@ -313,8 +382,12 @@ class CRCSAC(SAC):
 
     def dump_logs(self) -> None:
         """Write the log; ``time/env_steps`` counts the simulator's steps, ``time/total_timesteps`` the agent's decisions."""
+        counts = {"updates": self._n_updates, "agent_steps": self.num_timesteps}
         if self._env_steps is not None:
             self.logger.record("time/env_steps", self._env_steps)
+            counts["env_steps"] = self._env_steps
+        for name, rate in self._speedometer.read(counts).items():
+            self.logger.record(f"time/{name}_per_second", rate)
         super().dump_logs()
 
     def learn(
@@ -330,30 +403,20 @@ class CRCSAC(SAC):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_lr_schedules", "_augmentation", "_objective_weights"]
+        return [
+            *super()._excluded_save_params(),
+            "_lr_schedules",
+            "_augmentation",
+            "_objective_weights",
+            "_collapse_alarm",
+            "_speedometer",
+        ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         if self.policy.encoder_optimizer is not None:
             state_dicts = [*state_dicts, "policy.encoder_optimizer"]
         return state_dicts, variables
-
-
-def lr_schedule(learning_rate: LearningRate) -> FloatSchedule:
-    """
-    :param learning_rate: a number, a schedule of the remaining progress, or ``"lin_x"``: from x down to 0
-    :raises ValueError: for any other string
-    """
-    if isinstance(learning_rate, str):
-        kind, _, start = learning_rate.partition("_")
-        try:
-            value = float(start)
-        except ValueError:
-            kind = "unknown"
-        if kind != "lin":
-            raise ValueError(f"unknown learning rate {learning_rate!r}; expected a number, a schedule or 'lin_x', x a number")
-        return FloatSchedule(LinearSchedule(value, 0.0, 1.0))
-    return FloatSchedule(learning_rate)
 
 
 def _parameters(optimizer: th.optim.Optimizer) -> list[th.Tensor]:

@@ -176,6 +176,10 @@ class CRCPolicy(SACPolicy):
     :param actor_features: see :class:`CRCActor`
     :param log_std_bounds: see :class:`CRCActor`
     :param layer_norm: LayerNorm before each activation of actor and Q heads
+    :param encoder_steps: how many equal Adam steps the auxiliary gradient takes on the encoder; the released code of CRC-RL
+        makes three, with three optimizers, which move the encoder exactly as one does at three times the rate; for
+        comparison only
+    :param joint_update: leave the encoder to ``critic.optimizer`` alone (see CRCSAC)
     :raises ValueError: for what cannot work: gSDE, unscaled images, an encoder that is not a PixelEncoder, ...
     """
 
@@ -185,6 +189,7 @@ class CRCPolicy(SACPolicy):
     key_encoder: PixelEncoder
     objectives: nn.ModuleDict
     encoder_optimizer: th.optim.Optimizer | None
+    gradient_norms: th.Tensor
 
     def __init__(
         self,
@@ -207,6 +212,8 @@ class CRCPolicy(SACPolicy):
         actor_features: str = "conv",
         log_std_bounds: tuple[float, float] = (-10, 2),
         layer_norm: bool = False,
+        encoder_steps: int = 1,
+        joint_update: bool = False,
     ):
         if use_sde:
             raise ValueError("use_sde=True is not supported: gSDE would need exploration noise on the shared features")
@@ -214,6 +221,8 @@ class CRCPolicy(SACPolicy):
             raise ValueError("normalize_images=False is not supported: the encoder takes bytes and scales them itself")
         if not issubclass(features_extractor_class, PixelEncoder):
             raise ValueError(f"features_extractor_class must be a PixelEncoder, got {features_extractor_class.__name__}")
+        if encoder_steps < 1:
+            raise ValueError(f"encoder_steps={encoder_steps} must be at least 1")
         if actor_features not in ACTOR_FEATURES:
             raise ValueError(f"unknown actor_features {actor_features!r}; known: {', '.join(ACTOR_FEATURES)}")
         self._own_kwargs: dict[str, Any] = {
@@ -221,6 +230,8 @@ class CRCPolicy(SACPolicy):
             "actor_features": actor_features,
             "log_std_bounds": tuple(log_std_bounds),
             "layer_norm": layer_norm,
+            "encoder_steps": encoder_steps,
+            "joint_update": joint_update,
         }
         self._schedules = qf_lr_schedule or lr_schedule, encoder_lr_schedule or lr_schedule
         super().__init__(
@@ -253,13 +264,18 @@ class CRCPolicy(SACPolicy):
         self.key_encoder = self.critic_target.features_extractor
 
         self.actor.optimizer = self._optimizer(self.actor.own_parameters(), lr_schedule)
-        self.critic.optimizer = self._optimizer(list(self.critic.parameters()), qf_lr_schedule)
+        self.critic.optimizer = self._optimizer([*encoder.parameters(), *self.critic.head_parameters()], qf_lr_schedule)
         self.encoder_optimizer = None
         if self.objectives:
-            parameters = [*encoder.parameters(), *self.objectives.parameters()]
-            self.encoder_optimizer = self._optimizer(parameters, encoder_lr_schedule)
+            groups: list[dict[str, Any]] = [{"params": list(self.objectives.parameters()), "lr_factor": 1}]
+            if not self._own_kwargs["joint_update"]:
+                steps = self._own_kwargs["encoder_steps"]
+                groups.insert(0, {"params": list(encoder.parameters()), "lr_factor": steps})
+            self.encoder_optimizer = self._optimizer(groups, encoder_lr_schedule)
+        #: Moving average of each objective's gradient norm at the latent, 0 before the first update
+        self.register_buffer("gradient_norms", th.zeros(len(self.objectives)))
 
-    def _optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
+    def _optimizer(self, parameters: Any, lr_schedule: Schedule) -> th.optim.Optimizer:
         return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> CRCActor:

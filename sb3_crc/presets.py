@@ -30,6 +30,31 @@ PRESETS: dict[str, dict[str, Any]] = {
         "augmentation": "random_crop",
         "objectives": CRC_OBJECTIVES,
     },
+    # CRC-RL as its released code does it: the rows of the README's table of differences, by settings. The latent penalty
+    # and the decoder's weight decay enter the code's loss at weight 1, hence the division by the weight of the reconstruction.
+    "crc_release": {
+        "batch_size": 128,
+        "augmentation": "random_crop_overlay",
+        "augmentation_kwargs": {"last_offset": False},
+        "reencode": True,
+        "policy_kwargs": {"encoder_steps": 3},
+        "objectives": {
+            "contrastive": {"weight": 1 / 3, "initialization": "uniform", "symmetric": False},
+            "reconstruction": {"weight": 1 / 3, "bits": 5, "latent_penalty": 3e-6, "decoder_penalty": 3e-7},
+            "consistency": {
+                "weight": 1 / 3,
+                "predictor_side": "online",
+                "predictor": "batch_norm",
+                "normalize": True,
+                "reduction": "mean",
+            },
+        },
+    },
+    # CURL: the contrastive loss alone (arXiv 2004.04136)
+    "curl": {
+        "augmentation": "random_crop",
+        "objectives": {"contrastive": {"weight": 1.0, "initialization": "uniform", "symmetric": False}},
+    },
     # RAD: random crops and nothing else (arXiv 2004.14990)
     "rad": {"augmentation": "random_crop", "objectives": {}},
     # SAC from pixels, the floor of every comparison: the same networks, neither augmentation nor objective

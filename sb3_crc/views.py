@@ -8,27 +8,38 @@ anchor     augmented o_t                 yes, with   no             critic; acto
                                                                     reconstruction; s of the consistency loss
 positive   o_t, augmented anew           no          yes            key of the contrastive loss; s' of the consistency
                                                                     loss
+clean      the middle of o_t             no          yes            target of the consistency loss with its predictor
+                                                                    on the online side (``crc_release``)
 bootstrap  augmented o_{t+n}             yes,        yes            next actions (online), Q targets (key encoder)
                                          detached
 ========== ============================= =========== ============== ===================================================
 
-For every preset: what no consumer asks for is neither augmented nor encoded, so ``rad`` and ``pixel_sac`` make no positive.
+For every preset: what no consumer asks for is neither augmented nor encoded, so ``rad`` and ``pixel_sac`` make no positive
+and only ``crc_release`` a clean view. With ``anchor="center_crop"`` the anchor is the middle of o_t, not augmented. With
+``reencode=True`` (``crc_release``) the anchor is encoded anew after the critic's step: twice per update, thrice where the
+actor is updated too.
+
 B batch, C channels (of the whole frame stack), H, W height and width of the encoder's input, F flattened convolution
 output, Z latent, A action.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_crc.augmentations import center_crop
 from sb3_crc.encoder import PixelEncoder, scale_pixels
 
 
 class View:
     """
     One augmented batch of images; pixels and encodings are computed on first use and kept.
+
+    What is read of a view that trains the encoder are leaves: a loss is differentiated with respect to ``latent`` (and to
+    ``features``, if it reads those), and :meth:`backward` carries such gradients on into the encoder. So each loss is seen at
+    the latent for itself, and the encoder is passed once per optimizer, not once per loss.
 
     :param images: uint8 ``(B, C, H, W)``
     :param encoder: the online encoder
@@ -50,14 +61,12 @@ class View:
     @cached_property
     def features(self) -> th.Tensor:
         """Convolution output of the online encoder, ``(B, F)``."""
-        with th.set_grad_enabled(self._trains_encoder):
-            return self._encoder.convolve(self.pixels)
+        return self._leaf(self._features)
 
     @cached_property
     def latent(self) -> th.Tensor:
         """Latent of the online encoder, ``(B, Z)``."""
-        with th.set_grad_enabled(self._trains_encoder):
-            return self._encoder.project(self.features)
+        return self._leaf(self._latent)
 
     @cached_property
     def key_latent(self) -> th.Tensor:
@@ -65,6 +74,46 @@ class View:
         with th.no_grad():
             latents: th.Tensor = self._key_encoder(self.pixels)
         return latents
+
+    @property
+    def leaves(self) -> tuple[th.Tensor, th.Tensor]:
+        """``latent`` and ``features``, with respect to which losses are differentiated."""
+        return self.latent, self.features
+
+    def backward(
+        self, gradients: Sequence[th.Tensor | None], parameters: Sequence[th.Tensor], *, retain_graph: bool = False
+    ) -> tuple[th.Tensor | None, ...]:
+        """
+        Carry gradients at the leaves on into the encoder.
+
+        :param gradients: of some loss, at ``leaves``; None where the loss does not depend on a leaf
+        :param parameters: of the online encoder
+        :param retain_graph: keep the encoder's graph for another call
+        :return: the loss's gradient for each parameter; None where it has none
+        """
+        pairs = [pair for pair in zip((self._latent, self._features), gradients, strict=True) if pair[1] is not None]
+        if not pairs:
+            return (None,) * len(parameters)
+        outputs, grad_outputs = zip(*pairs, strict=True)
+        return th.autograd.grad(outputs, parameters, grad_outputs, retain_graph=retain_graph, allow_unused=True)
+
+    def forget_encoding(self) -> None:
+        """Encode anew when an online encoding is asked for next, by the weights of then."""
+        for name in ("features", "latent", "_features", "_latent"):
+            self.__dict__.pop(name, None)
+
+    @cached_property
+    def _features(self) -> th.Tensor:
+        with th.set_grad_enabled(self._trains_encoder):
+            return self._encoder.convolve(self.pixels)
+
+    @cached_property
+    def _latent(self) -> th.Tensor:
+        with th.set_grad_enabled(self._trains_encoder):
+            return self._encoder.project(self._features)
+
+    def _leaf(self, encoding: th.Tensor) -> th.Tensor:
+        return encoding.detach().requires_grad_(self._trains_encoder)
 
 
 class Views:
@@ -77,6 +126,7 @@ class Views:
     :param key_encoder: its exponential moving average
     :param gamma: discount for buffers that return none of their own
     :param reward_scale: factor on the rewards
+    :param augment_anchor: False: the anchor is the middle of o_t (the literal reading of CRC-RL's consistency section)
     """
 
     def __init__(
@@ -88,10 +138,13 @@ class Views:
         *,
         gamma: float = 0.99,
         reward_scale: float = 1.0,
+        augment_anchor: bool = True,
     ):
         self._batch = batch
         self._augment = augment
         self._encoders = encoder, key_encoder
+        self._size = encoder.input_shape[1:]
+        self._augment_anchor = augment_anchor
         self.actions = batch.actions  # (B, A)
         self.rewards = batch.rewards * reward_scale  # (B, 1)
         discounts = gamma if batch.discounts is None else batch.discounts
@@ -100,17 +153,23 @@ class Views:
     @cached_property
     def anchor(self) -> View:
         """Augmented o_t, the one view whose online encoding carries gradients."""
-        return self._view(self._batch.observations, trains_encoder=True)
+        augment = self._augment if self._augment_anchor else self._middle
+        return View(augment(self._batch.observations), *self._encoders, trains_encoder=True)
 
     @cached_property
     def positive(self) -> View:
         """o_t again, augmented independently of the anchor."""
-        return self._view(self._batch.observations)
+        return View(self._augment(self._batch.observations), *self._encoders, trains_encoder=False)
+
+    @cached_property
+    def clean(self) -> View:
+        """The middle of o_t, not augmented."""
+        return View(self._middle(self._batch.observations), *self._encoders, trains_encoder=False)
 
     @cached_property
     def bootstrap(self) -> View:
         """Augmented o_{t+n}, from which the return is bootstrapped."""
-        return self._view(self._batch.next_observations)
+        return View(self._augment(self._batch.next_observations), *self._encoders, trains_encoder=False)
 
-    def _view(self, observations: th.Tensor, trains_encoder: bool = False) -> View:
-        return View(self._augment(observations), *self._encoders, trains_encoder=trains_encoder)
+    def _middle(self, images: th.Tensor) -> th.Tensor:
+        return center_crop(images, self._size)

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 
 from sb3_crc import CRCSAC, PRESETS, CRCPolicy
-from sb3_crc.crc_sac import lr_schedule
+from sb3_crc.schedules import lr_schedule
 from tests.conftest import POLICY_KWARGS, ClockEnv, NoiseEnv, make_model
 
 
@@ -29,8 +29,10 @@ def test_every_preset_trains(preset: str) -> None:
     before = [p.detach().clone() for p in model.policy.critic.features_extractor.parameters()]
     model.train(gradient_steps=2, batch_size=16)
     assert not all(map(th.equal, before, model.policy.critic.features_extractor.parameters()))
-    logged = {key.removeprefix("representation/") for key in model.logger.name_to_value if key.startswith("representation/")}
-    assert logged == ({"contrastive", "reconstruction", "consistency", "loss"} if preset == "crc" else set())
+    for name in PRESETS[preset].get("objectives", {}):
+        for key in (name, f"{name}_gradient_norm", f"{name}_td_cosine"):
+            assert np.isfinite(model.logger.name_to_value[f"representation/{key}"])
+    assert ("representation/loss" in model.logger.name_to_value) == bool(PRESETS[preset]["objectives"])
 
 
 @pytest.mark.parametrize(("terminates", "expected"), [(False, 10.0), (True, 1 + 0.9 + 0.81 + 0.729 + 0.6561)])
@@ -160,7 +162,7 @@ def test_max_grad_norm_clips_each_step() -> None:
     norms: list[float] = []
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.policy.encoder_optimizer):
         optimizer.register_step_pre_hook(
-            lambda o, *_: norms.append(th.cat([p.grad.flatten() for p in o.param_groups[0]["params"]]).norm().item())
+            lambda o, *_: norms.append(th.cat([p.grad.flatten() for g in o.param_groups for p in g["params"]]).norm().item())
         )
     model.train(gradient_steps=2, batch_size=16)
     assert len(norms) == 5 and max(norms) <= 1e-3 * 1.001

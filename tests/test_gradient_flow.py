@@ -98,10 +98,12 @@ def test_both_gradients_are_taken_at_the_same_weights() -> None:
     views = model._sample_views(16)
     views.anchor.images, views.positive.images, views.bootstrap.images  # draw the augmentations  # noqa: B018
     th.manual_seed(2)
+    encoder = list(model.critic.features_extractor.parameters())
+    views.anchor.__dict__["latent"] = model.critic.features_extractor(views.anchor.images)  # with its graph
     critic_loss = model._critic_loss(views)
     total = sum(objective(views) / 3 for objective in model.policy.objectives.values())
-    encoder = list(model.critic.features_extractor.parameters())
     gradients = [th.autograd.grad(loss, encoder, retain_graph=True) for loss in (critic_loss, total)]
+    views.anchor.forget_encoding()
 
     th.manual_seed(2)
     model._update_critic_and_encoder(views)

@@ -11,6 +11,12 @@ from sb3_crc.encoder import PixelEncoder
 from sb3_crc.views import Views
 
 
+def check_choice(objective: str, name: str, value: object, known: tuple[str, ...]) -> None:
+    """:raises ValueError: naming the setting and what is allowed, if ``value`` is not among ``known``"""
+    if value not in known:
+        raise ValueError(f"{objective}: unknown {name} {value!r}; known: {', '.join(known)}")
+
+
 class AuxiliaryObjective(nn.Module, ABC):
     """
     A loss on the latents that trains the encoder beside the critic, with the weights that only this loss needs.
@@ -29,6 +35,8 @@ class AuxiliaryObjective(nn.Module, ABC):
         self.latent_dim = latent_dim
         self.observation_shape = observation_shape
         self.action_dim = action_dim
+        #: Scalars of the last forward pass, logged as ``representation/<objective>_<name>``
+        self.metrics: dict[str, th.Tensor] = {}
 
     @classmethod
     def for_encoder(cls, encoder: PixelEncoder, action_dim: int, **own: Any) -> Self:

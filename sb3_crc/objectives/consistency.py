@@ -5,12 +5,15 @@ B batch, Z latent.
 
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_crc.encoder import init_orthogonal
-from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.objectives.base import AuxiliaryObjective, check_choice
 from sb3_crc.views import Views
 
 REDUCTIONS = ("sum", "mean")
+SIDES = ("key", "online")
+PREDICTORS = ("layer_norm", "batch_norm")
 
 
 def consistency_loss(predicted: th.Tensor, target: th.Tensor, reduction: str = "sum") -> th.Tensor:
@@ -31,11 +34,15 @@ def consistency_loss(predicted: th.Tensor, target: th.Tensor, reduction: str = "
 
 class Consistency(AuxiliaryObjective):
     """
-    Predict the online latent s of the anchor from the key encoder's latent s' of the positive.
+    Predict one network's latent from the other's. Alone this loss collapses the latent, so use it beside others.
 
-    The encoder receives its gradient through s only; alone this loss collapses the latent, so use it beside others.
-
-    :param hidden_dim: width of the predictor h
+    :param predictor_side: ``"key"``: h(s') predicts s, as the paper writes: from the key encoder's latent of the positive the
+        online latent of the anchor, through which alone the encoder receives gradient; ``"online"``: h(s) predicts
+        the key encoder's latent of the clean view, as the released code does (and SODA, arXiv 2011.13389)
+    :param predictor: ``"layer_norm"``: Linear, LayerNorm, ReLU, Linear; ``"batch_norm"``: Linear, BatchNorm, ReLU twice, then
+        Linear (the released code)
+    :param hidden_dim: width of the predictor
+    :param normalize: both sides are divided by their norm first (the released code, SODA)
     :param reduction: see :func:`consistency_loss`
     """
 
@@ -45,18 +52,31 @@ class Consistency(AuxiliaryObjective):
         observation_shape: tuple[int, int, int],
         action_dim: int,
         *,
+        predictor_side: str = "key",
+        predictor: str = "layer_norm",
         hidden_dim: int = 128,
+        normalize: bool = False,
         reduction: str = "sum",
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
-        if reduction not in REDUCTIONS:
-            raise ValueError(f"consistency: unknown reduction {reduction!r}; known: {', '.join(REDUCTIONS)}")
+        check_choice("consistency", "predictor_side", predictor_side, SIDES)
+        check_choice("consistency", "predictor", predictor, PREDICTORS)
+        check_choice("consistency", "reduction", reduction, REDUCTIONS)
+        self.predictor_side = predictor_side
+        self.normalize = normalize
         self.reduction = reduction
-        self.predictor = nn.Sequential(
-            nn.Linear(latent_dim, hidden_dim), nn.LayerNorm(hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, latent_dim)
-        )
-        self.predictor.apply(init_orthogonal)
+        norm, hidden_layers = (nn.LayerNorm, 1) if predictor == "layer_norm" else (nn.BatchNorm1d, 2)
+        layers: list[nn.Module] = []
+        for width in (latent_dim, hidden_dim)[:hidden_layers]:
+            layers += [nn.Linear(width, hidden_dim), norm(hidden_dim), nn.ReLU()]
+        self.predictor = nn.Sequential(*layers, nn.Linear(hidden_dim, latent_dim)).apply(init_orthogonal)
 
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
-        return consistency_loss(self.predictor(views.positive.key_latent), views.anchor.latent, self.reduction)
+        if self.predictor_side == "key":
+            predicted, target = self.predictor(views.positive.key_latent), views.anchor.latent
+        else:
+            predicted, target = self.predictor(views.anchor.latent), views.clean.key_latent
+        if self.normalize:
+            predicted, target = F.normalize(predicted, dim=1), F.normalize(target, dim=1)
+        return consistency_loss(predicted, target, self.reduction)

@@ -3,12 +3,16 @@
 B batch, Z latent.
 """
 
+import math
+
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.objectives.base import AuxiliaryObjective, check_choice
 from sb3_crc.views import Views
+
+INITIALIZATIONS = ("identity", "uniform")
 
 
 def info_nce(query: th.Tensor, key: th.Tensor, bilinear: th.Tensor) -> th.Tensor:
@@ -21,26 +25,54 @@ def info_nce(query: th.Tensor, key: th.Tensor, bilinear: th.Tensor) -> th.Tensor
     :param bilinear: W, ``(Z, Z)``
     :return: scalar; log B where the keys tell nothing
     """
-    logits = query.float() @ bilinear.float() @ key.float().T  # (B, B)
-    return F.cross_entropy(logits, th.arange(len(query), device=query.device))
+    return _cross_entropy(_logits(query, key, bilinear))
 
 
 class Contrastive(AuxiliaryObjective):
     """
     InfoNCE between the online encoding of the anchor and the key encoder's of the positive.
 
-    W starts at I / sqrt(Z) and stays symmetric, as the paper asks: it is (A + A') / 2 of the parameter A.
+    :param initialization: of A: ``"identity"``: I / sqrt(Z), so that q'Wk starts as a scaled dot product; ``"uniform"``:
+        U[0, 1) (CURL, the released code of CRC-RL)
+    :param symmetric: W is (A + A') / 2, symmetric as the paper asks; False: W is A
     """
 
-    def __init__(self, latent_dim: int, observation_shape: tuple[int, int, int], action_dim: int):
+    def __init__(
+        self,
+        latent_dim: int,
+        observation_shape: tuple[int, int, int],
+        action_dim: int,
+        *,
+        initialization: str = "identity",
+        symmetric: bool = True,
+    ):
         super().__init__(latent_dim, observation_shape, action_dim)
-        self.weight = nn.Parameter(th.eye(latent_dim) / latent_dim**0.5)  # A
+        check_choice("contrastive", "initialization", initialization, INITIALIZATIONS)
+        self.symmetric = symmetric
+        start = th.eye(latent_dim) / latent_dim**0.5 if initialization == "identity" else th.rand(latent_dim, latent_dim)
+        self.weight = nn.Parameter(start)  # A
 
     @property
     def bilinear(self) -> th.Tensor:
-        """W, ``(Z, Z)``, symmetric."""
-        return (self.weight + self.weight.T) / 2
+        """W, ``(Z, Z)``."""
+        return (self.weight + self.weight.T) / 2 if self.symmetric else self.weight
 
     def forward(self, views: Views) -> th.Tensor:
-        """:param views: the views of one batch; :return: the loss, a scalar"""
-        return info_nce(views.anchor.latent, views.positive.key_latent, self.bilinear)
+        """
+        :param views: the views of one batch
+        :return: the loss, a scalar; ``metrics`` then hold the share of queries whose own key scores best, and log B minus the
+            loss, a lower bound of the mutual information in nats (arXiv 1807.03748)
+        """
+        logits = _logits(views.anchor.latent, views.positive.key_latent, self.bilinear)
+        loss = _cross_entropy(logits)
+        correct = logits.detach().argmax(dim=1) == th.arange(len(logits), device=logits.device)
+        self.metrics = {"accuracy": correct.float().mean(), "information": math.log(len(logits)) - loss.detach()}
+        return loss
+
+
+def _logits(query: th.Tensor, key: th.Tensor, bilinear: th.Tensor) -> th.Tensor:
+    return query.float() @ bilinear.float() @ key.float().T  # (B, B)
+
+
+def _cross_entropy(logits: th.Tensor) -> th.Tensor:
+    return F.cross_entropy(logits, th.arange(len(logits), device=logits.device))

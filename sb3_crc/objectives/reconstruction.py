@@ -27,6 +27,19 @@ def reconstruction_loss(decoded: th.Tensor, target: th.Tensor) -> th.Tensor:
     return F.mse_loss(decoded, target)
 
 
+def quantize(images: th.Tensor, bits: int) -> th.Tensor:
+    """
+    Keep the highest bits, and spread each level evenly by uniform noise.
+
+    :param images: uint8 ``(B, C, H, W)``
+    :param bits: to keep, 1 to 8
+    :return: float32 in [-0.5, 0.5), channels last in memory
+    """
+    levels = 2**bits
+    kept = (images >> (8 - bits)).to(th.float32, memory_format=th.channels_last)
+    return (kept + th.rand_like(kept)).div_(levels).sub_(0.5)
+
+
 class Reconstruction(AuxiliaryObjective):
     """
     L_r of CRC-RL: paint the anchor from its own latent, with penalties on the latent and on the decoder's weights (as in
@@ -35,6 +48,8 @@ class Reconstruction(AuxiliaryObjective):
     :param channels: filters of the encoder's convolutions, which the decoder mirrors
     :param strides: their strides
     :param kernel_size: the side of their kernels
+    :param bits: quantise the target to so many bits per channel, dithered by uniform noise, and shift it to [-0.5, 0.5)
+        (SAC+AE, after Glow, arXiv 1807.03039); None: the pixels as they are, in [0, 1]
     :param latent_penalty: lambda_s, factor of the mean over the batch of ``||s||^2 / 2``
     :param decoder_penalty: lambda_theta, factor of ``||theta||^2 / 2``
     """
@@ -48,10 +63,14 @@ class Reconstruction(AuxiliaryObjective):
         channels: Sequence[int] = (32, 32, 32, 32),
         strides: Sequence[int] = (2, 1, 1, 1),
         kernel_size: int = 3,
+        bits: int | None = None,
         latent_penalty: float = 1e-6,
         decoder_penalty: float = 1e-7,
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
+        if bits is not None and not 1 <= bits <= 8:
+            raise ValueError(f"reconstruction: bits={bits} must be from 1 to 8, or None")
+        self.bits = bits
         self.latent_penalty = latent_penalty
         self.decoder_penalty = decoder_penalty
         self.decoder = PixelDecoder(latent_dim, observation_shape, channels=channels, strides=strides, kernel_size=kernel_size)
@@ -65,7 +84,9 @@ class Reconstruction(AuxiliaryObjective):
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
         latent = views.anchor.latent
-        loss = reconstruction_loss(self.decoder(latent), views.anchor.pixels)
+        anchor = views.anchor
+        target = anchor.pixels if self.bits is None else quantize(anchor.images, self.bits)
+        loss = reconstruction_loss(self.decoder(latent), target)
         if self.latent_penalty > 0:
             loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
         if self.decoder_penalty > 0:

@@ -1,0 +1,88 @@
+"""The auxiliary gradient: what each objective asks of the latent, weighted and summed.
+
+B batch, F flattened convolution output, Z latent.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_crc.views import Views
+
+#: Share of the old value in the moving average of the gradient norms
+NORM_DECAY = 0.99
+
+Gradient = th.Tensor | None
+
+
+@dataclass(frozen=True)
+class AuxiliaryGradients:
+    """
+    Gradient of the weighted sum of the objectives.
+
+    :param leaves: at the anchor's latent ``(B, Z)`` and features ``(B, F)``; None where no objective depends on one
+    :param own: for each of the objectives' own parameters, in the order of ``objectives.parameters()``
+    :param metrics: log key -> scalar
+    """
+
+    leaves: tuple[Gradient, Gradient]
+    own: list[Gradient]
+    metrics: dict[str, th.Tensor]
+
+    def plus(self, latent_gradient: th.Tensor) -> tuple[Gradient, Gradient]:
+        """:return: ``leaves`` with another loss's gradient at the latent added"""
+        return _add(self.leaves[0], latent_gradient, 1), self.leaves[1]
+
+
+def auxiliary_gradients(
+    objectives: nn.ModuleDict,
+    weights: Mapping[str, float],
+    views: Views,
+    td_gradient: th.Tensor,
+    gradient_norms: th.Tensor,
+    *,
+    balance: bool,
+) -> AuxiliaryGradients:
+    """
+    Differentiate each objective down to the latent, where their sizes and directions can be compared.
+
+    :param objectives: name -> objective
+    :param weights: name -> weight
+    :param views: of one batch
+    :param td_gradient: of the critic loss at the latent, ``(B, Z)``, to compare directions with
+    :param gradient_norms: moving average of each objective's gradient norm at the latent, updated in place
+    :param balance: divide each objective by its moving average before weighting
+    """
+    leaves: list[Gradient] = [None, None]
+    own: list[Gradient] = []
+    metrics: dict[str, th.Tensor] = {}
+    total = td_gradient.new_zeros(())
+    for index, (name, objective) in enumerate(objectives.items()):
+        loss = objective(views)
+        inputs = [*views.anchor.leaves, *objective.parameters()]
+        gradients = th.autograd.grad(loss, inputs, allow_unused=True)
+        at_latent = th.zeros_like(td_gradient) if gradients[0] is None else gradients[0]
+        norm = at_latent.norm()
+        old = gradient_norms[index]
+        gradient_norms[index] = th.where(old > 0, NORM_DECAY * old + (1 - NORM_DECAY) * norm, norm)
+
+        scale = weights[name] / gradient_norms[index].clamp(min=1e-12) if balance else weights[name]
+        leaves = [_add(*pair, scale) for pair in zip(leaves, gradients[:2], strict=True)]
+        own += [_add(None, gradient, scale) for gradient in gradients[2:]]
+        total = total + scale * loss.detach()
+        metrics[f"representation/{name}"] = loss
+        metrics[f"representation/{name}_gradient_norm"] = norm
+        metrics[f"representation/{name}_td_cosine"] = F.cosine_similarity(at_latent.flatten(), td_gradient.flatten(), dim=0)
+        for key, value in objective.metrics.items():  # type: ignore[union-attr, operator]
+            metrics[f"representation/{name}_{key}"] = value
+    metrics["representation/loss"] = total
+    return AuxiliaryGradients((leaves[0], leaves[1]), own, metrics)
+
+
+def _add(total: Gradient, gradient: Gradient, scale: float | th.Tensor) -> Gradient:
+    if gradient is None:
+        return total
+    return scale * gradient if total is None else total + scale * gradient
