@@ -5,13 +5,16 @@ stack, from torch's global CPU generator, whatever the device; every offset is p
 """
 
 import inspect
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
 from torch.nn import functional as F
+
+from sb3_crc.settings import check_name
 
 ImageSize = int | tuple[int, int]
 
@@ -134,6 +137,28 @@ AUGMENTATIONS: dict[str, Callable[..., th.Tensor]] = {
     "random_overlay": random_overlay,
     "random_crop_overlay": random_crop_overlay,
 }
+
+
+def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ...]) -> Callable[[th.Tensor], th.Tensor]:
+    """
+    Give an augmentation its arguments, and try it on one black frame, rather than fail after the warm-up of a run.
+
+    :param name: in :data:`AUGMENTATIONS`
+    :param kwargs: its arguments
+    :param shape: ``(C, H, W)`` of the frames
+    :return: maps uint8 ``(B, C, H, W)`` to uint8 images
+    :raises ValueError: for an unknown name or argument, or one that does not suit the frames
+    """
+    check_name("augmentation", name, AUGMENTATIONS)
+    for key in kwargs:
+        check_name(f"argument of {name} in augmentation_kwargs", key, list(inspect.signature(AUGMENTATIONS[name]).parameters)[1:])
+    augmentation = partial(AUGMENTATIONS[name], **kwargs)
+    with th.random.fork_rng(devices=[]):  # the trial must not change the run's random numbers
+        try:
+            augmentation(th.zeros(1, *shape, dtype=th.uint8))
+        except TypeError as error:
+            raise ValueError(f"augmentation_kwargs={dict(kwargs)} do not suit {name!r}: {error}") from error
+    return augmentation
 
 
 def takes_size(augmentation: str) -> bool:

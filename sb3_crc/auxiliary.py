@@ -1,6 +1,5 @@
 """What AuxiliaryLossCallback does to a stock SB3 algorithm: settings, updates, and the file beside the model."""
 
-import difflib
 import io
 import json
 import math
@@ -26,6 +25,7 @@ from sb3_crc.encoder import PixelEncoder, image_shape
 from sb3_crc.extractors import ExtractorEncoder, checked_augmentation, trainable_extractor, trainable_parameters
 from sb3_crc.objectives import AuxiliaryObjective, ObjectiveSettings, build_objectives, objective_weights
 from sb3_crc.schedules import lr_schedule, set_learning_rate
+from sb3_crc.settings import check_name
 from sb3_crc.views import Views
 
 #: Version of the file's layout
@@ -63,11 +63,7 @@ class AuxiliarySettings:
         rate = lr_schedule(self.learning_rate)(1.0)
         if not (math.isfinite(rate) and rate > 0):
             raise ValueError(f"learning_rate={self.learning_rate!r} must be finite and above 0")
-        if self.augmentation not in AUGMENTATIONS:
-            nearest = difflib.get_close_matches(str(self.augmentation), AUGMENTATIONS, n=1, cutoff=0)
-            raise ValueError(
-                f"unknown augmentation {self.augmentation!r}; did you mean {nearest[0]!r}? Known: {', '.join(AUGMENTATIONS)}"
-            )
+        check_name("augmentation", self.augmentation, AUGMENTATIONS)
         try:
             json.dumps(asdict(self))
         except TypeError as error:

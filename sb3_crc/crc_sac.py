@@ -3,32 +3,32 @@
 B batch, Z latent, A action.
 """
 
-import difflib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import FloatSchedule, polyak_update
-from stable_baselines3.sac.sac import SAC
-from typing_extensions import Self
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import polyak_update
 
-from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, center_crop, takes_size
+from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, bind_augmentation, center_crop, takes_size
+from sb3_crc.base_sac import BaseCRCSAC
 from sb3_crc.encoder import image_shape
-from sb3_crc.instruments import CollapseAlarm, Speedometer, latent_health, update_ratio
+from sb3_crc.finite import LossHistory
+from sb3_crc.instruments import CollapseAlarm, watched
 from sb3_crc.objectives import ObjectiveSettings, objective_weights
-from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
+from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
 from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
-from sb3_crc.schedules import LearningRate, lr_schedule, set_learning_rate
+from sb3_crc.schedules import LearningRate
+from sb3_crc.settings import check_name, check_ranges
 from sb3_crc.views import Views
 
 #: Side of the network's input over that of the frame, where crops are cut: 84 of 100 pixels (RAD, CURL, CRC-RL).
 CROP_RATIO = 0.84
+#: Metrics that must stay finite, beside the objectives
+LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")
 #: Updates between two looks at the latent's health
 HEALTH_INTERVAL = 100
 
@@ -36,7 +36,7 @@ ANCHORS = ("augmented", "center_crop")
 BALANCES = ("none", "grad_norm")
 
 
-class CRCSAC(SAC):
+class CRCSAC(BaseCRCSAC):
     """
     SAC whose every gradient step also trains the shared CNN with weighted auxiliary objectives, by default the three of
     CRC-RL: contrastive, reconstruction, consistency (arXiv 2301.13473).
@@ -76,12 +76,6 @@ class CRCSAC(SAC):
     :raises ValueError: for observations or settings that cannot work, naming the value and what is allowed
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy}
-    policy: CRCPolicy
-    actor: CRCActor
-    critic: CRCCritic
-    critic_target: CRCCritic
-
     def __init__(
         self,
         policy: str | type[CRCPolicy],
@@ -115,7 +109,8 @@ class CRCSAC(SAC):
         **kwargs: Any,
     ):
         super().__init__(
-            policy,
+            # A class, since for the name SB3 would send users of Dict observations to a policy that is not ours
+            self._get_policy_from_name(policy) if isinstance(policy, str) else policy,  # type: ignore[arg-type]
             env,
             learning_rate,  # type: ignore[arg-type]
             buffer_size,
@@ -145,7 +140,6 @@ class CRCSAC(SAC):
         self.initial_updates = initial_updates
         self.reward_scale = reward_scale
         self.max_grad_norm = max_grad_norm
-        self._env_steps: int | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -155,11 +149,10 @@ class CRCSAC(SAC):
         if self.use_sde or self.optimize_memory_usage:
             refused = "use_sde" if self.use_sde else "optimize_memory_usage"
             raise ValueError(f"{refused}=True is not supported by {type(self).__name__}")
+        image_shape(self.observation_space)
+        check_ranges(self)
         for name, known in (("augmentation", tuple(AUGMENTATIONS)), ("anchor", ANCHORS), ("balance", BALANCES)):
-            value = getattr(self, name)
-            if value not in known:
-                nearest = difflib.get_close_matches(str(value), known, n=1, cutoff=0)[0]
-                raise ValueError(f"unknown {name} {value!r}; did you mean {nearest!r}? Known: {', '.join(known)}")
+            check_name(name, getattr(self, name), known)
         if self.joint_update and self.reencode:
             raise ValueError("joint_update and reencode exclude each other: one encoding for both gradients, or one for each")
         self._objective_weights = objective_weights(self.objectives)
@@ -175,14 +168,19 @@ class CRCSAC(SAC):
             "qf_lr_schedule": self._lr_schedules["qf_learning_rate"],
             "encoder_lr_schedule": self._lr_schedules["encoder_learning_rate"],
         }
+        own_buffer = self.replay_buffer_class, self.replay_buffer_kwargs
+        self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
         super()._setup_model()
         self.policy_kwargs = own_policy_kwargs
+        self.replay_buffer_class, self.replay_buffer_kwargs = own_buffer  # SB3 derives them from n_steps and gamma
 
-        self._collapse_alarm, self._speedometer = CollapseAlarm(), Speedometer()
+        self._collapse_alarm = CollapseAlarm()
         size = self.policy.critic.features_extractor.input_shape[1:]
-        augmentation_kwargs = {"size": size} if takes_size(self.augmentation) else {}
-        augmentation_kwargs.update(self.augmentation_kwargs or {})
-        self._augmentation = partial(AUGMENTATIONS[self.augmentation], **augmentation_kwargs)
+        sized = {"size": size} if takes_size(self.augmentation) else {}
+        augmentation_kwargs = {**sized, **(self.augmentation_kwargs or {})}
+        self._augmentation = bind_augmentation(self.augmentation, augmentation_kwargs, image_shape(self.observation_space))
+        with th.random.fork_rng(devices=[]):
+            self._augment(th.zeros(1, *image_shape(self.observation_space), dtype=th.uint8))
         if self.log_ent_coef is not None:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999))  # CURL's, as SAC+AE's
 
@@ -193,21 +191,6 @@ class CRCSAC(SAC):
         ratio = CROP_RATIO if takes_size(self.augmentation) else 1
         return round(ratio * height), round(ratio * width)
 
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = lr_schedule(self.learning_rate)
-        self._lr_schedules: dict[str, FloatSchedule] = {"learning_rate": self.lr_schedule}
-        for name in ("qf_learning_rate", "encoder_learning_rate", "ent_coef_learning_rate"):
-            value = getattr(self, name)
-            self._lr_schedules[name] = self.lr_schedule if value is None else lr_schedule(value)
-
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        if policy_name not in self.policy_aliases:
-            raise ValueError(
-                f"policy {policy_name!r} is not supported: {type(self).__name__} learns from images with 'CnnPolicy'; "
-                "for flat observations use stable_baselines3.SAC"
-            )
-        return super()._get_policy_from_name(policy_name)
-
     # -- The algorithm -------------------------------------------------------------------------------------------------
 
     def train(self, gradient_steps: int, batch_size: int = 512) -> None:
@@ -217,24 +200,44 @@ class CRCSAC(SAC):
         :param gradient_steps: number of updates, to which the first call adds ``initial_updates``
         :param batch_size: transitions per update
         """
+        self._check_stored(batch_size)
         self.policy.set_training_mode(True)
         self._update_learning_rates()
         if self._n_updates == 0:
             gradient_steps += self.initial_updates
 
-        records: dict[str, list[th.Tensor]] = {}
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            views = self._sample_views(batch_size)
-            with self._instruments(views) as metrics:
-                metrics |= self._update_critic_and_encoder(views)
-            if self._n_updates % self.policy_delay == 0:
-                metrics |= self._update_actor_and_temperature(views)
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_targets()
-            for name, value in metrics.items():
-                records.setdefault(name, []).append(value)
-        self._record(records)
+        history = LossHistory(self._n_updates + 1, {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)})
+        try:
+            for _ in range(gradient_steps):
+                self._n_updates += 1
+                metrics = history.begin()
+                views = self._sample_views(batch_size)
+                with self._instruments(views) as health:
+                    metrics |= self._update_critic_and_encoder(views)
+                metrics |= health
+                if self._n_updates % self.policy_delay == 0:
+                    metrics |= self._update_actor_and_temperature(views)
+                if self._n_updates % self.target_update_interval == 0:
+                    self._update_targets()
+        except ValueError:
+            self._stop_if_not_finite(history, batch_size)  # torch refuses to sample actions from NaN
+            raise
+        self._record(history, batch_size)
+
+    def _check_stored(self, batch_size: int) -> None:
+        """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
+        assert self.replay_buffer is not None
+        stored = self.replay_buffer.size() * self.replay_buffer.n_envs
+        if batch_size > stored:
+            raise ValueError(
+                f"batch_size={batch_size} is more than the {stored} transitions that are stored: raise learning_starts "
+                f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
+            )
+
+    def _stop_if_not_finite(self, history: LossHistory, batch_size: int) -> None:
+        assert self.replay_buffer is not None
+        normalize, folder = self._vec_normalize_env, self.logger.dir
+        history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
 
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
@@ -263,7 +266,7 @@ class CRCSAC(SAC):
         anchor, encoder = views.anchor, list(self.critic.features_extractor.parameters())
         critic_loss = self._critic_loss(views)
         td_gradient, *head_gradients = th.autograd.grad(critic_loss, [anchor.latent, *self.critic.head_parameters()])
-        metrics = {"train/critic_loss": critic_loss}
+        metrics = {"train/critic_loss": critic_loss.detach()}
         optimizer = self.policy.encoder_optimizer
         if optimizer is None:
             self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
@@ -309,12 +312,12 @@ class CRCSAC(SAC):
         min_q_values = self.critic.q_values(views.anchor.latent.detach(), actions).min(dim=1, keepdim=True).values
         actor_loss = (self._temperature() * log_prob - min_q_values).mean()
         self._step(self.actor.optimizer, th.autograd.grad(actor_loss, _parameters(self.actor.optimizer)))
-        metrics = {"train/actor_loss": actor_loss, "train/entropy": -log_prob.mean()}
+        metrics = {"train/actor_loss": actor_loss.detach(), "train/entropy": -log_prob.detach().mean()}
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob.detach() + float(self.target_entropy))).mean()
             self._step(self.ent_coef_optimizer, th.autograd.grad(ent_coef_loss, [self.log_ent_coef]))
-            metrics["train/ent_coef_loss"] = ent_coef_loss
+            metrics["train/ent_coef_loss"] = ent_coef_loss.detach()
         return metrics | {"train/ent_coef": self._temperature()}
 
     def _update_targets(self) -> None:
@@ -340,83 +343,22 @@ class CRCSAC(SAC):
 
     # -- Around it -----------------------------------------------------------------------------------------------------
 
-    def _update_learning_rates(self) -> None:
-        optimizers = {
-            "learning_rate": self.actor.optimizer,
-            "qf_learning_rate": self.critic.optimizer,
-            "encoder_learning_rate": self.policy.encoder_optimizer,
-            "ent_coef_learning_rate": self.ent_coef_optimizer,
-        }
-        for name, optimizer in optimizers.items():
-            if optimizer is not None:
-                value = self._lr_schedules[name](self._current_progress_remaining)
-                set_learning_rate(optimizer, value)
-                self.logger.record(f"train/{name}", value)
-
-    @contextmanager
-    def _instruments(self, views: Views) -> Iterator[dict[str, th.Tensor]]:
-        """Once in a while, look at the latent, and at how far encoder and Q heads move."""
-        metrics: dict[str, th.Tensor] = {}
-        looks = self._n_updates % HEALTH_INTERVAL == 0
+    def _instruments(self, views: Views) -> AbstractContextManager[dict[str, th.Tensor]]:
+        if self._n_updates % HEALTH_INTERVAL != 0:
+            return nullcontext({})
         parts = {"encoder": list(self.critic.features_extractor.parameters()), "q_heads": self.critic.head_parameters()}
-        if looks:
-            metrics = latent_health(views.anchor.latent.detach(), views.anchor.features.detach())
-            before = {name: [parameter.detach().clone() for parameter in part] for name, part in parts.items()}
-        yield metrics
-        if looks:
-            metrics |= {f"train/{name}_update_ratio": update_ratio(before[name], part) for name, part in parts.items()}
+        return watched(lambda: views.anchor.leaves, parts)
 
-    def _record(self, records: dict[str, list[th.Tensor]]) -> None:
-        """Log the means over one call of :meth:`train`, with a single transfer from the device."""
-        means = th.stack([th.stack([value.detach().reshape(()) for value in values]).mean() for values in records.values()])
-        for name, mean in zip(records, means.tolist(), strict=True):
+    def _record(self, history: LossHistory, batch_size: int) -> None:
+        """Log the means over one call of :meth:`train`."""
+        means = history.means()
+        if not np.isfinite(list(means.values())).all():
+            self._stop_if_not_finite(history, batch_size)
+        for name, mean in means.items():
             self.logger.record(name, mean)
-            if name == "representation/latent_std":
-                self._collapse_alarm.check(mean, HEALTH_INTERVAL * len(records[name]))
+        if "representation/latent_std" in means:
+            self._collapse_alarm.check(means["representation/latent_std"], max(HEALTH_INTERVAL, len(history.updates)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        if all("env_steps" in info for info in infos):
-            self._env_steps = sum(info["env_steps"] for info in infos)
-
-    def dump_logs(self) -> None:
-        """Write the log; ``time/env_steps`` counts the simulator's steps, ``time/total_timesteps`` the agent's decisions."""
-        counts = {"updates": self._n_updates, "agent_steps": self.num_timesteps}
-        if self._env_steps is not None:
-            self.logger.record("time/env_steps", self._env_steps)
-            counts["env_steps"] = self._env_steps
-        for name, rate in self._speedometer.read(counts).items():
-            self.logger.record(f"time/{name}_per_second", rate)
-        super().dump_logs()
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "CRCSAC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_lr_schedules",
-            "_augmentation",
-            "_objective_weights",
-            "_collapse_alarm",
-            "_speedometer",
-        ]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        if self.policy.encoder_optimizer is not None:
-            state_dicts = [*state_dicts, "policy.encoder_optimizer"]
-        return state_dicts, variables
 
 
 def _parameters(optimizer: th.optim.Optimizer) -> list[th.Tensor]:

@@ -16,6 +16,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_crc.augmentations import ImageSize, center_crop
+from sb3_crc.settings import check_name
 
 LATENT_ACTIVATIONS: dict[str, type[nn.Module]] = {"none": nn.Identity, "tanh": nn.Tanh}
 
@@ -110,8 +111,7 @@ def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.
 
     :raises ValueError: for an unknown activation
     """
-    if activation not in LATENT_ACTIVATIONS:
-        raise ValueError(f"unknown latent_activation {activation!r}; known: {', '.join(LATENT_ACTIVATIONS)}")
+    check_name("latent_activation", activation, LATENT_ACTIVATIONS)
     return nn.Sequential(nn.Linear(in_features, latent_dim), nn.LayerNorm(latent_dim), LATENT_ACTIVATIONS[activation]())
 
 
@@ -126,8 +126,21 @@ def image_shape(observation_space: spaces.Space[Any]) -> tuple[int, ...]:
     :raises ValueError: if the space is anything else
     """
     if not is_image_space(observation_space) or not is_image_space_channels_first(observation_space):  # type: ignore[arg-type]
-        raise ValueError(f"expected uint8 images (channels, height, width) with values in [0, 255], got {observation_space}")
+        if isinstance(observation_space, spaces.Dict):
+            hint = "; of Dict observations choose one image (a gymnasium ObservationWrapper)"
+        elif observation_space.shape is not None and len(observation_space.shape) == 3:
+            hint = "; if a VecNormalize is around the environment, give it norm_obs=False"
+        else:
+            hint = ""
+        raise ValueError(
+            f"expected uint8 images (channels, height, width) with values in [0, 255], got {observation_space}{hint}"
+        )
     assert observation_space.shape is not None
+    channels, *size = observation_space.shape
+    if channels >= min(size):
+        raise ValueError(
+            f"channels must be fewer than rows and columns, got {observation_space.shape} as (channels, rows, columns)"
+        )
     return observation_space.shape
 
 

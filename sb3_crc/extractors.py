@@ -5,7 +5,6 @@ B batch, C channels (of the whole frame stack), H, W image height and width, Z l
 
 import inspect
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import torch as th
@@ -15,7 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_crc.augmentations import AUGMENTATIONS
+from sb3_crc.augmentations import bind_augmentation
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder, image_shape
 from sb3_crc.objectives import Reconstruction
@@ -102,12 +101,9 @@ def checked_augmentation(
     :return: the augmentation, which has been tried on a blank image
     :raises ValueError: if its arguments are wrong or its output is of another size
     """
-    augmentation = partial(AUGMENTATIONS[name], **kwargs)
-    with th.random.fork_rng(devices=[]):  # the trial must not change the run's random numbers
-        try:
-            result = augmentation(th.zeros((1, *shape), dtype=th.uint8))
-        except TypeError as error:
-            raise ValueError(f"augmentation_kwargs={dict(kwargs)} do not suit {name!r}: {error}") from error
+    augmentation = bind_augmentation(name, kwargs, shape)
+    with th.random.fork_rng(devices=[]):
+        result = augmentation(th.zeros((1, *shape), dtype=th.uint8))
     if tuple(result.shape[1:]) not in (shape, input_shape):
         raise ValueError(
             f"augmentation {name!r} with {dict(kwargs)} turns images of {shape} into {tuple(result.shape[1:])}, but the "

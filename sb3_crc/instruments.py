@@ -5,7 +5,8 @@ B batch, F flattened convolution output, Z latent.
 
 import time
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch as th
 
@@ -41,6 +42,23 @@ def update_ratio(before: Iterable[th.Tensor], after: Iterable[th.Tensor]) -> th.
     old, new = (th.cat([tensor.detach().flatten() for tensor in tensors]) for tensors in (before, after))
     ratio: th.Tensor = (new - old).norm() / old.norm().clamp(min=1e-12)
     return ratio
+
+
+@contextmanager
+def watched(
+    latents: Callable[[], tuple[th.Tensor, th.Tensor]], parts: Mapping[str, Sequence[th.Tensor]]
+) -> Iterator[dict[str, th.Tensor]]:
+    """
+    Look at the latent, and at how far weights move within the context.
+
+    :param latents: gives latent ``(B, Z)`` and features ``(B, F)``
+    :param parts: name -> weights
+    :return: filled with metrics when the context ends
+    """
+    metrics = latent_health(*(tensor.detach() for tensor in latents()))
+    before = {name: [weight.detach().clone() for weight in weights] for name, weights in parts.items()}
+    yield metrics
+    metrics |= {f"train/{name}_update_ratio": update_ratio(before[name], weights) for name, weights in parts.items()}
 
 
 class CollapseAlarm:

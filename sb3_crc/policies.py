@@ -28,6 +28,7 @@ from torch import nn
 
 from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
 from sb3_crc.objectives import ObjectiveSettings, build_objectives
+from sb3_crc.settings import check_name
 from sb3_crc.views import View
 
 ACTOR_FEATURES = ("conv", "latent")
@@ -223,8 +224,7 @@ class CRCPolicy(SACPolicy):
             raise ValueError(f"features_extractor_class must be a PixelEncoder, got {features_extractor_class.__name__}")
         if encoder_steps < 1:
             raise ValueError(f"encoder_steps={encoder_steps} must be at least 1")
-        if actor_features not in ACTOR_FEATURES:
-            raise ValueError(f"unknown actor_features {actor_features!r}; known: {', '.join(ACTOR_FEATURES)}")
+        check_name("actor_features", actor_features, ACTOR_FEATURES)
         self._own_kwargs: dict[str, Any] = {
             "objectives": objectives or {},
             "actor_features": actor_features,

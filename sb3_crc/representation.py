@@ -73,7 +73,7 @@ def auxiliary_gradients(
         leaves = [_add(*pair, scale) for pair in zip(leaves, gradients[:2], strict=True)]
         own += [_add(None, gradient, scale) for gradient in gradients[2:]]
         total = total + scale * loss.detach()
-        metrics[f"representation/{name}"] = loss
+        metrics[f"representation/{name}"] = loss.detach()
         metrics[f"representation/{name}_gradient_norm"] = norm
         metrics[f"representation/{name}_td_cosine"] = F.cosine_similarity(at_latent.flatten(), td_gradient.flatten(), dim=0)
         for key, value in objective.metrics.items():  # type: ignore[union-attr, operator]

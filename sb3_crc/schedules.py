@@ -11,7 +11,7 @@ def lr_schedule(learning_rate: LearningRate) -> FloatSchedule:
     """
     :param learning_rate: a number, a schedule of the remaining progress (1 to 0), or ``"lin_x"``: from x down to 0
     :return: learning rate as a function of the remaining progress
-    :raises ValueError: for a negative number or any other string
+    :raises ValueError: for any other string
     """
     if isinstance(learning_rate, str):
         kind, _, start = learning_rate.partition("_")
@@ -22,9 +22,13 @@ def lr_schedule(learning_rate: LearningRate) -> FloatSchedule:
         if kind != "lin":
             raise ValueError(f"unknown learning rate {learning_rate!r}; expected a number, a schedule or 'lin_x', x a number")
         return FloatSchedule(LinearSchedule(value, 0.0, 1.0))
-    if isinstance(learning_rate, int | float) and not 0 <= learning_rate < float("inf"):
-        raise ValueError(f"learning rate {learning_rate!r} must be a finite number >= 0")
     return FloatSchedule(learning_rate)
+
+
+def check_learning_rate(name: str, value: float) -> None:
+    """:raises ValueError: unless ``value`` is a finite number >= 0"""
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"{name} must be a finite number >= 0, got {value}")
 
 
 def set_learning_rate(optimizer: th.optim.Optimizer, learning_rate: float) -> None:

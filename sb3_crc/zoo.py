@@ -22,6 +22,7 @@ from sb3_crc.analysis.films import film
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.presets import PRESETS
+from sb3_crc.settings import check_name
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +34,9 @@ def preset_class(preset: str) -> type[CRCSAC]:
     CRCSAC with the defaults of a preset, for the zoo's table of algorithms. Its zips load as CRCSAC too.
 
     :param preset: a key of :data:`~sb3_crc.PRESETS`
+    :raises ValueError: for an unknown preset
     """
+    check_name("preset", preset, PRESETS)
 
     def __init__(self: CRCSAC, *args: Any, **kwargs: Any) -> None:
         CRCSAC.__init__(self, *args, **{**PRESETS[preset], **kwargs})

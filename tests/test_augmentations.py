@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_crop, random_overlay, random_shift, takes_size
+from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_crop, random_shift, takes_size
 
 
 def coordinates(batch: int, size: int) -> th.Tensor:

@@ -546,7 +546,7 @@ def test_bad_arguments_are_refused_at_once(kwargs: dict[str, Any], message: str)
             r"turns images of \(3, 36, 36\) into \(3, 30, 30\)",
         ),
         ({"augmentation": "random_crop"}, r"augmentation_kwargs={} do not suit 'random_crop': .*missing.*'size'"),
-        ({"augmentation_kwargs": {"padding": 2}}, "do not suit 'random_shift': .*unexpected keyword argument 'padding'"),
+        ({"augmentation_kwargs": {"padding": 2}}, "augmentation_kwargs 'padding'; did you mean 'pad'"),
         ({"batch_size": 101}, "batch_size=101 is more than the replay buffer holds: 100"),
     ],
 )

@@ -1,6 +1,5 @@
 """Auxiliary losses for the encoder, and how a mapping of names and weights becomes modules."""
 
-import difflib
 import importlib
 import inspect
 import math
@@ -15,6 +14,7 @@ from sb3_crc.objectives.base import AuxiliaryObjective
 from sb3_crc.objectives.consistency import Consistency, consistency_loss
 from sb3_crc.objectives.contrastive import Contrastive, info_nce
 from sb3_crc.objectives.reconstruction import Reconstruction, reconstruction_loss
+from sb3_crc.settings import check_name
 
 __all__ = [
     "OBJECTIVES",
@@ -45,6 +45,8 @@ def objective_weights(objectives: ObjectiveSettings) -> dict[str, float]:
     :return: name (of a dotted path its last part) -> weight
     :raises ValueError: for a weight that is missing, negative or not finite
     """
+    if not isinstance(objectives, Mapping):
+        raise ValueError(f"objectives must be a mapping name -> weight, got {objectives!r}")
     weights = {}
     for name, setting in objectives.items():
         weight = setting.get("weight") if isinstance(setting, Mapping) else setting
@@ -89,11 +91,7 @@ def _objective_class(name: str) -> type[AuxiliaryObjective]:
     if name in OBJECTIVES:
         return OBJECTIVES[name]
     if "." not in name:
-        nearest = difflib.get_close_matches(name, OBJECTIVES, n=1, cutoff=0)
-        raise ValueError(
-            f"unknown objective {name!r}; did you mean {nearest[0]!r}? "
-            f"Known: {', '.join(OBJECTIVES)}, or the dotted path of a class of yours"
-        )
+        check_name("objective", name, [*OBJECTIVES, "<module>.<YourObjective>"])
     module_name, _, class_name = name.rpartition(".")
     try:
         cls = getattr(importlib.import_module(module_name), class_name)

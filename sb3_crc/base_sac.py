@@ -1,0 +1,134 @@
+"""SB3's SAC as CRCSAC needs it around the algorithm: our policy, four learning rates, counted steps, checked files."""
+
+import io
+import pathlib
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.sac.sac import SAC
+from typing_extensions import Self
+
+from sb3_crc.instruments import Speedometer
+from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
+from sb3_crc.saved_model import check_saved_model
+from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
+from sb3_crc.settings import check_name
+
+
+class BaseCRCSAC(SAC):
+    """What CRCSAC changes of SB3's SAC beside the algorithm itself; it does not train."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy}
+    policy: CRCPolicy
+    actor: CRCActor
+    critic: CRCCritic
+    critic_target: CRCCritic
+    qf_learning_rate: LearningRate | None
+    encoder_learning_rate: LearningRate | None
+    ent_coef_learning_rate: LearningRate | None
+    _env_steps: int | None = None
+    _speedometer: Speedometer
+
+    def _setup_model(self) -> None:
+        self._speedometer = Speedometer()
+        super()._setup_model()
+
+    def _setup_lr_schedule(self) -> None:
+        self._lr_schedules: dict[str, FloatSchedule] = {}
+        for name in ("learning_rate", "qf_learning_rate", "encoder_learning_rate", "ent_coef_learning_rate"):
+            value = getattr(self, name)
+            self._lr_schedules[name] = self._lr_schedules["learning_rate"] if value is None else lr_schedule(value)
+            check_learning_rate(name, self._lr_schedules[name](1))
+        self.lr_schedule = self._lr_schedules["learning_rate"]
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f"policy {policy_name!r} is not supported: {type(self).__name__} learns from images with 'CnnPolicy'; "
+                "of Dict observations give it the one image (a gymnasium ObservationWrapper), "
+                "for flat observations use stable_baselines3.SAC"
+            )
+        return super()._get_policy_from_name(policy_name)
+
+    def _update_learning_rates(self) -> None:
+        optimizers = {
+            "learning_rate": self.actor.optimizer,
+            "qf_learning_rate": self.critic.optimizer,
+            "encoder_learning_rate": self.policy.encoder_optimizer,
+            "ent_coef_learning_rate": self.ent_coef_optimizer,
+        }
+        for name, optimizer in optimizers.items():
+            if optimizer is not None:
+                value = self._lr_schedules[name](self._current_progress_remaining)
+                check_learning_rate(name, value)
+                set_learning_rate(optimizer, value)
+                self.logger.record(f"train/{name}", value)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if all("env_steps" in info for info in infos):
+            self._env_steps = sum(info["env_steps"] for info in infos)
+
+    def dump_logs(self) -> None:
+        """Write the log; ``time/env_steps`` counts the simulator's steps, ``time/total_timesteps`` the agent's decisions."""
+        counts = {"updates": self._n_updates, "agent_steps": self.num_timesteps}
+        if self._env_steps is not None:
+            self.logger.record("time/env_steps", self._env_steps)
+            counts["env_steps"] = self._env_steps
+        for name, rate in self._speedometer.read(counts).items():
+            self.logger.record(f"time/{name}_per_second", rate)
+        super().dump_logs()
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CRCSAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps."""
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        As in SB3.
+
+        :raises ValueError: for a file that is not a whole model of CRCSAC, or arguments that it does not have
+        """
+        saved = check_saved_model(path)
+        for key in kwargs:
+            if key not in saved:
+                check_name("argument of load", key, sorted(saved))
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            "_lr_schedules",
+            "_augmentation",
+            "_objective_weights",
+            "_collapse_alarm",
+            "_speedometer",
+        ]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        if self.policy.encoder_optimizer is not None:
+            state_dicts = [*state_dicts, "policy.encoder_optimizer"]
+        return state_dicts, variables
