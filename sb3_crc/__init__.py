@@ -8,6 +8,7 @@ from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.envs.tasks import register_environments
+from sb3_crc.evaluation import QBiasEvalCallback
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
 
@@ -20,6 +21,7 @@ __all__ = [
     "ObjectiveScheduleCallback",
     "PixelDecoder",
     "PixelEncoder",
+    "QBiasEvalCallback",
     "ReconstructionImageCallback",
     "make_dmc",
 ]

@@ -150,8 +150,9 @@ def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ..
     :raises ValueError: for an unknown name or argument, or one that does not suit the frames
     """
     check_name("augmentation", name, AUGMENTATIONS)
+    known = list(inspect.signature(AUGMENTATIONS[name]).parameters)[1:]  # after the images
     for key in kwargs:
-        check_name(f"argument of {name} in augmentation_kwargs", key, list(inspect.signature(AUGMENTATIONS[name]).parameters)[1:])
+        check_name(f"argument of {name} in augmentation_kwargs", key, known)
     augmentation = partial(AUGMENTATIONS[name], **kwargs)
     with th.random.fork_rng(devices=[]):  # the trial must not change the run's random numbers
         try:

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import rl_zoo3.exp_manager
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -20,6 +21,7 @@ from stable_baselines3.common.utils import configure_logger
 
 from sb3_crc.analysis.films import film
 from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.evaluation import QBiasEvalCallback
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
@@ -108,6 +110,7 @@ def register() -> None:
     """Put the presets into the zoo's table of algorithms, and our manager into its training script."""
     for name in PRESETS:
         rl_zoo3.ALGOS[name] = preset_class(name)
+    rl_zoo3.exp_manager.EvalCallback = QBiasEvalCallback  # type: ignore[attr-defined]
     rl_zoo3.train.ExperimentManager = CRCExperimentManager  # type: ignore[attr-defined]
 
 

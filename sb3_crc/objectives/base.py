@@ -11,12 +11,6 @@ from sb3_crc.encoder import PixelEncoder
 from sb3_crc.views import Views
 
 
-def check_choice(objective: str, name: str, value: object, known: tuple[str, ...]) -> None:
-    """:raises ValueError: naming the setting and what is allowed, if ``value`` is not among ``known``"""
-    if value not in known:
-        raise ValueError(f"{objective}: unknown {name} {value!r}; known: {', '.join(known)}")
-
-
 class AuxiliaryObjective(nn.Module, ABC):
     """
     A loss on the latents that trains the encoder beside the critic, with the weights that only this loss needs.

@@ -8,7 +8,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_crc.encoder import init_orthogonal
-from sb3_crc.objectives.base import AuxiliaryObjective, check_choice
+from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.settings import check_name
 from sb3_crc.views import Views
 
 REDUCTIONS = ("sum", "mean")
@@ -26,8 +27,7 @@ def consistency_loss(predicted: th.Tensor, target: th.Tensor, reduction: str = "
     :return: scalar
     :raises ValueError: for an unknown reduction
     """
-    if reduction not in REDUCTIONS:
-        raise ValueError(f"unknown reduction {reduction!r}; known: {', '.join(REDUCTIONS)}")
+    check_name("reduction", reduction, REDUCTIONS)
     squared = (predicted - target).square()  # (B, Z)
     return squared.sum(dim=1).mean() if reduction == "sum" else squared.mean()
 
@@ -59,9 +59,9 @@ class Consistency(AuxiliaryObjective):
         reduction: str = "sum",
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
-        check_choice("consistency", "predictor_side", predictor_side, SIDES)
-        check_choice("consistency", "predictor", predictor, PREDICTORS)
-        check_choice("consistency", "reduction", reduction, REDUCTIONS)
+        check_name("consistency: predictor_side", predictor_side, SIDES)
+        check_name("consistency: predictor", predictor, PREDICTORS)
+        check_name("consistency: reduction", reduction, REDUCTIONS)
         self.predictor_side = predictor_side
         self.normalize = normalize
         self.reduction = reduction

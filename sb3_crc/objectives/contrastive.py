@@ -9,7 +9,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_crc.objectives.base import AuxiliaryObjective, check_choice
+from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.settings import check_name
 from sb3_crc.views import Views
 
 INITIALIZATIONS = ("identity", "uniform")
@@ -47,7 +48,7 @@ class Contrastive(AuxiliaryObjective):
         symmetric: bool = True,
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
-        check_choice("contrastive", "initialization", initialization, INITIALIZATIONS)
+        check_name("contrastive: initialization", initialization, INITIALIZATIONS)
         self.symmetric = symmetric
         start = th.eye(latent_dim) / latent_dim**0.5 if initialization == "identity" else th.rand(latent_dim, latent_dim)
         self.weight = nn.Parameter(start)  # A

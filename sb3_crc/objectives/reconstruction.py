@@ -13,18 +13,25 @@ from typing_extensions import Self
 from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives.base import AuxiliaryObjective
+from sb3_crc.settings import check_name
 from sb3_crc.views import Views
 
+REDUCTIONS = ("mean", "sum")
 
-def reconstruction_loss(decoded: th.Tensor, target: th.Tensor) -> th.Tensor:
+
+def reconstruction_loss(decoded: th.Tensor, target: th.Tensor, reduction: str = "mean") -> th.Tensor:
     """
-    Mean squared error over batch, channels and pixels: -log p(x|s) of CRC-RL's L_r for a Gaussian, up to constants.
+    Squared error: -log p(x|s) of CRC-RL's L_r for a Gaussian, up to constants.
 
     :param decoded: ``(B, C, H, W)``
     :param target: ``(B, C, H, W)``
+    :param reduction: ``"mean"`` or ``"sum"`` over channels and pixels; over the batch it is always the mean
     :return: scalar
+    :raises ValueError: for an unknown reduction
     """
-    return F.mse_loss(decoded, target)
+    check_name("reduction", reduction, REDUCTIONS)
+    loss = F.mse_loss(decoded, target)
+    return loss * target[0].numel() if reduction == "sum" else loss
 
 
 def quantize(images: th.Tensor, bits: int) -> th.Tensor:
@@ -48,6 +55,7 @@ class Reconstruction(AuxiliaryObjective):
     :param channels: filters of the encoder's convolutions, which the decoder mirrors
     :param strides: their strides
     :param kernel_size: the side of their kernels
+    :param reduction: see :func:`reconstruction_loss`
     :param bits: quantise the target to so many bits per channel, dithered by uniform noise, and shift it to [-0.5, 0.5)
         (SAC+AE, after Glow, arXiv 1807.03039); None: the pixels as they are, in [0, 1]
     :param latent_penalty: lambda_s, factor of the mean over the batch of ``||s||^2 / 2``
@@ -63,6 +71,7 @@ class Reconstruction(AuxiliaryObjective):
         channels: Sequence[int] = (32, 32, 32, 32),
         strides: Sequence[int] = (2, 1, 1, 1),
         kernel_size: int = 3,
+        reduction: str = "mean",
         bits: int | None = None,
         latent_penalty: float = 1e-6,
         decoder_penalty: float = 1e-7,
@@ -70,6 +79,8 @@ class Reconstruction(AuxiliaryObjective):
         super().__init__(latent_dim, observation_shape, action_dim)
         if bits is not None and not 1 <= bits <= 8:
             raise ValueError(f"reconstruction: bits={bits} must be from 1 to 8, or None")
+        check_name("reconstruction: reduction", reduction, REDUCTIONS)
+        self.reduction = reduction
         self.bits = bits
         self.latent_penalty = latent_penalty
         self.decoder_penalty = decoder_penalty
@@ -86,7 +97,7 @@ class Reconstruction(AuxiliaryObjective):
         latent = views.anchor.latent
         anchor = views.anchor
         target = anchor.pixels if self.bits is None else quantize(anchor.images, self.bits)
-        loss = reconstruction_loss(self.decoder(latent), target)
+        loss = reconstruction_loss(self.decoder(latent), target, self.reduction)
         if self.latent_penalty > 0:
             loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
         if self.decoder_penalty > 0:

@@ -50,6 +50,8 @@ def test_reconstruction_loss_equals_numpy() -> None:
     decoded, target = rng.normal(size=(4, 3, 5, 6)), rng.normal(size=(4, 3, 5, 6))
     expected = sum((d - t) ** 2 for d, t in zip(decoded.ravel(), target.ravel(), strict=True)) / decoded.size
     assert reconstruction_loss(th.tensor(decoded), th.tensor(target)).item() == pytest.approx(expected)
+    summed = reconstruction_loss(th.tensor(decoded), th.tensor(target), reduction="sum")
+    assert summed.item() == pytest.approx(expected * 3 * 5 * 6)
     assert reconstruction_loss(th.full((2, 3, 4, 4), 0.25), th.full((2, 3, 4, 4), 0.75)).item() == 0.25
 
 
@@ -60,7 +62,7 @@ def test_consistency_loss_equals_numpy_in_both_reductions() -> None:
     pair = th.tensor(predicted), th.tensor(target)
     assert consistency_loss(*pair).item() == pytest.approx(expected)
     assert consistency_loss(*pair, reduction="mean").item() == pytest.approx(expected / 10)
-    with pytest.raises(ValueError, match="median.*sum, mean"):
+    with pytest.raises(ValueError, match="median.*did you mean.*sum, mean"):
         consistency_loss(*pair, reduction="median")
 
 

@@ -1,0 +1,83 @@
+"""Is the Q bias that is logged the one that is defined?"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from sb3_crc.evaluation import QBiasEvalCallback, q_value_and_soft_return
+from tests.conftest import ClockEnv, NoiseEnv, make_model
+
+OPTIMUM = {False: 10.0, True: 1 + 0.9 + 0.81 + 0.729 + 0.6561}
+
+
+def constant_critic(model: Any, value: float) -> None:
+    """A critic that always answers ``value``."""
+    with th.no_grad():
+        for head in model.critic.q_networks:
+            head[-1].weight.zero_()
+            head[-1].bias.fill_(value)
+
+
+@pytest.mark.parametrize("terminates", [False, True])
+def test_the_soft_return_bootstraps_at_a_time_limit_only(terminates: bool) -> None:
+    model = make_model(ClockEnv(terminates), image_size=36, gamma=0.9, ent_coef=0.0)
+    constant_critic(model, 10.0)
+    frames = [ClockEnv(terminates).reset()[0]] * 5
+    episode = [(frame, np.zeros(1, np.float32), 1.0) for frame in frames]
+    q_value, soft_return = q_value_and_soft_return(model, episode, None if terminates else frames[0])
+    assert q_value == pytest.approx(10.0)
+    assert soft_return == pytest.approx(OPTIMUM[terminates], rel=1e-5)
+
+
+def test_entropy_counts_from_the_second_step_on_and_rewards_are_scaled() -> None:
+    model = make_model(ClockEnv(True), image_size=36, gamma=0.5, ent_coef=2.0, reward_scale=3.0)
+    model.actor.action_log_prob = lambda images: (th.zeros(len(images), 1), th.full((len(images),), -0.25))
+    frame = ClockEnv(True).reset()[0]
+    episode = [(frame, np.zeros(1, np.float32), reward) for reward in (1.0, 2.0, 4.0)]
+    expected = 3.0 + 0.5 * (6.0 + 2 * 0.25) + 0.25 * (12.0 + 2 * 0.25)
+    assert q_value_and_soft_return(model, episode, None)[1] == pytest.approx(expected)
+
+
+class Record(KVWriter):
+    """Keeps what the logger is told to write."""
+
+    def __init__(self) -> None:
+        self.written: dict[str, Any] = {}
+
+    def write(self, key_values: dict[str, Any], *_: Any) -> None:
+        self.written.update(key_values)
+
+    def close(self) -> None: ...
+
+
+def test_the_bias_is_logged_at_each_evaluation() -> None:
+    model = make_model(ClockEnv(False), image_size=36, gamma=0.9, ent_coef=0.0, learning_rate=0.0, encoder_learning_rate=0.0)
+    constant_critic(model, 4.0)
+    record = Record()
+    model.set_logger(Logger(None, [record]))
+    callback = QBiasEvalCallback(ClockEnv(False), eval_freq=6, n_eval_episodes=3, verbose=0, warn=False)
+    model.learn(6, callback=callback, reset_num_timesteps=False)
+    soft_return = OPTIMUM[True] + 0.9**5 * 4.0
+    assert record.written["eval/q_value"] == pytest.approx(4.0, abs=1e-4)
+    assert record.written["eval/soft_return"] == pytest.approx(soft_return, rel=1e-4)
+    assert record.written["eval/q_bias"] == pytest.approx(4.0 - soft_return, rel=1e-4)
+
+
+def test_evaluating_draws_no_random_numbers_of_the_run() -> None:
+    model = make_model()
+    frame = NoiseEnv().reset(seed=0)[0]
+    state = th.get_rng_state()
+    q_value_and_soft_return(model, [(frame, np.zeros(2, np.float32), 1.0)] * 3, frame)
+    assert th.equal(state, th.get_rng_state())
+
+
+def test_other_algorithms_are_evaluated_as_ever() -> None:
+    model = SAC("CnnPolicy", NoiseEnv(), buffer_size=100, learning_starts=50)
+    callback = QBiasEvalCallback(NoiseEnv(), eval_freq=10, n_eval_episodes=1, verbose=0, warn=False)
+    model.learn(20, callback=callback)
+    assert np.isfinite(callback.last_mean_reward)
+    assert "eval/q_bias" not in model.logger.name_to_value
