@@ -19,9 +19,10 @@ class QBiasEvalCallback(EvalCallback):
     ``eval/q_bias`` = ``eval/q_value`` - ``eval/soft_return``, means over the evaluation's episodes, where ``q_value`` is
     min Q(s_0, a_0) over the heads, and ``soft_return`` is what Q should say: r_0 + sum over t >= 1 of
     gamma^t (r_t - alpha log pi(a|s_t)), and where the time limit ended the episode
-    gamma^T (min Q(s_T, a) - alpha log pi(a|s_T)), with actions a drawn from the policy (Haarnoja et al. 2018, arXiv 1812.05905, eq. 3). The evaluation itself acts by the
-    policy's mean, so even a perfect critic shows a small bias; a growing one is overestimation. Rewards count with
-    ``reward_scale``. Arguments are EvalCallback's; for other algorithms it is EvalCallback.
+    gamma^T (min Q(s_T, a) - alpha log pi(a|s_T)), with actions a drawn from the policy (Haarnoja et al. 2018,
+    arXiv 1812.05905, eq. 3). The evaluation itself acts by the policy's mean, so even a perfect critic shows a small bias; a
+    growing one is overestimation. Rewards count with ``reward_scale``. Arguments are EvalCallback's; for other algorithms it
+    is EvalCallback.
     """
 
     def _init_callback(self) -> None:

@@ -1,7 +1,7 @@
 """200 updates from a committed buffer give the committed losses: nobody changes the algorithm without noticing.
 
-Written by ``python -m tests.test_trace`` on the pinned torch; write it anew only when the algorithm is meant to change, and say
-so in the changelog.
+Written by ``python -m tests.test_trace`` on the pinned torch; write it anew only when the algorithm is meant to change, and
+say so in the changelog.
 """
 
 import json
