@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+from inspect import signature
 from typing import Any, ClassVar
 
 import numpy as np
@@ -111,10 +112,9 @@ class BaseCRCSAC(SAC):
 
         :raises ValueError: for a file that is not a whole model of CRCSAC, or arguments that it does not have
         """
-        saved = check_saved_model(path)
+        known = {*check_saved_model(path), *signature(cls.__init__).parameters}
         for key in kwargs:
-            if key not in saved:
-                check_name("argument of load", key, sorted(saved))
+            check_name("argument of load", key, sorted(known))
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:

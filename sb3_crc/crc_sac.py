@@ -268,12 +268,12 @@ class CRCSAC(BaseCRCSAC):
         td_gradient, *head_gradients = th.autograd.grad(critic_loss, [anchor.latent, *self.critic.head_parameters()])
         metrics = {"train/critic_loss": critic_loss.detach()}
         optimizer = self.policy.encoder_optimizer
-        if optimizer is None:
+        if optimizer is None or self.reencode:
             self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
+        if optimizer is None:
             return metrics
 
         if self.reencode:
-            self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
             anchor.forget_encoding()
         auxiliary = self._auxiliary_gradients(views, td_gradient)
         if self.joint_update:
