@@ -78,6 +78,13 @@ def make_model(env: gym.Env[Any, Any] | None = None, **kwargs: Any) -> CRCSAC:
     return model.learn(40)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests may take their time: the limit of the fast ones would fail them on a busy machine."""
+    for item in items:
+        if item.get_closest_marker("slow") is not None:
+            item.add_marker(pytest.mark.timeout(900))
+
+
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
     """Two test processes with two threads each would ruin each other's speed."""
