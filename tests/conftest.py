@@ -86,6 +86,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
-    """Two test processes with two threads each would ruin each other's speed."""
+def repeatable() -> None:
+    """The same random numbers at each run; one thread, since two processes with two each would ruin each other's speed."""
     th.set_num_threads(1)
+    th.manual_seed(0)
+    np.random.seed(0)
