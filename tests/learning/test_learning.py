@@ -84,7 +84,8 @@ def test_each_loss_alone_overfits_one_batch(name: str, share: float) -> None:
         "features_extractor_kwargs": {"channels": [16, 16], "strides": [2, 2], "features_dim": 50, "image_size": 40},
     }
     settings: dict[str, Any] = {"objectives": {name: 1.0}, "encoder_learning_rate": 3e-3, "policy_kwargs": policy_kwargs}
-    model = make_model(augmentation="center_crop", **settings)
+    model = make_model(augmentation="center_crop", learning_starts=64, **settings)
+    model.learn(24, reset_num_timesteps=False)  # 64 transitions are stored
     model.critic.optimizer.step = lambda: None  # this loss alone
     batch = model.replay_buffer.sample(64)
     images = pictures(64)
