@@ -7,6 +7,7 @@ import pytest
 import torch as th
 
 from sb3_crc import crc_sac
+from sb3_crc.finite import LossHistory
 from sb3_crc.instruments import CollapseAlarm, Speedometer, latent_health, update_ratio
 from tests.conftest import make_model
 
@@ -85,3 +86,18 @@ def test_one_transfer_from_the_device_per_call(monkeypatch: pytest.MonkeyPatch) 
         spy(name)
     model.train(gradient_steps=4, batch_size=16)
     assert transfers == ["tolist"]
+
+
+def test_metrics_keep_no_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A graph keeps its batch alive: 500 initial updates once took 14 GB."""
+    kept: list[th.Tensor] = []
+    means = LossHistory.means
+
+    def spy(history: LossHistory) -> dict[str, float]:
+        kept.extend(value for metrics in history.updates for value in metrics.values())
+        return means(history)
+
+    monkeypatch.setattr(LossHistory, "means", spy)
+    make_model().train(gradient_steps=4, batch_size=16)
+    assert len(kept) > 20
+    assert all(value.grad_fn is None for value in kept)
