@@ -207,21 +207,17 @@ class CRCSAC(BaseCRCSAC):
             gradient_steps += self.initial_updates
 
         history = LossHistory(self._n_updates + 1, {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)})
-        try:
-            for _ in range(gradient_steps):
-                self._n_updates += 1
-                metrics = history.begin()
-                views = self._sample_views(batch_size)
-                with self._instruments(views) as health:
-                    metrics |= self._update_critic_and_encoder(views)
-                metrics |= health
-                if self._n_updates % self.policy_delay == 0:
-                    metrics |= self._update_actor_and_temperature(views)
-                if self._n_updates % self.target_update_interval == 0:
-                    self._update_targets()
-        except ValueError:
-            self._stop_if_not_finite(history, batch_size)  # torch refuses to sample actions from NaN
-            raise
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            metrics = history.begin()
+            views = self._sample_views(batch_size)
+            with self._instruments(views) as health:
+                metrics |= self._update_critic_and_encoder(views)
+            metrics |= health
+            if self._n_updates % self.policy_delay == 0:
+                metrics |= self._update_actor_and_temperature(views)
+            if self._n_updates % self.target_update_interval == 0:
+                self._update_targets()
         self._record(history, batch_size)
 
     def _check_stored(self, batch_size: int) -> None:

@@ -25,6 +25,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
+from typing_extensions import Self
 
 from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
 from sb3_crc.objectives import ObjectiveSettings, build_objectives
@@ -32,6 +33,15 @@ from sb3_crc.settings import check_name
 from sb3_crc.views import View
 
 ACTOR_FEATURES = ("conv", "latent")
+
+
+class SquashedGaussian(SquashedDiagGaussianDistribution):
+    """SB3's squashed Gaussian without torch's checks of its arguments, each of which would wait for the device."""
+
+    def proba_distribution(self, mean_actions: th.Tensor, log_std: th.Tensor) -> Self:
+        """:param mean_actions: ``(B, A)``; :param log_std: ``(B, A)``; :return: itself"""
+        self.distribution = th.distributions.Normal(mean_actions, log_std.exp(), validate_args=False)
+        return self
 
 
 class CRCActor(Actor):
@@ -56,6 +66,7 @@ class CRCActor(Actor):
     ):
         super().__init__(*args, **kwargs)
         encoder = self.features_extractor
+        self.action_dist = SquashedGaussian(get_action_dim(self.action_space))  # type: ignore[assignment]
         self.actor_features = actor_features
         self.log_std_bounds = log_std_bounds
         self.projection: nn.Module = nn.Identity()
