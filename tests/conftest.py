@@ -1,5 +1,7 @@
 """Tiny image environments and models, so that a test takes a second."""
 
+import signal
+import threading
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +10,10 @@ import pytest
 import torch as th
 
 from sb3_crc import CRCSAC
+
+# Started in the background by a script, pytest ignores Ctrl-C, and so would the processes in which tests send it
+if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SIZE = 40
 #: Networks that are large enough to be real and small enough to be quick
