@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.decoder import PixelDecoder
@@ -18,6 +19,8 @@ __all__ = [
     "PRESETS",
     "AuxiliaryLossCallback",
     "CRCPolicy",
+    "DictFrameReplayBuffer",
+    "FrameReplayBuffer",
     "ObjectiveScheduleCallback",
     "PixelDecoder",
     "PixelEncoder",

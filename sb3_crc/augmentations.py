@@ -2,13 +2,15 @@
 
 B batch, C channels (of the whole frame stack), H, W height and width. One offset is drawn per sample and used for its whole
 stack, from torch's global CPU generator, whatever the device; every offset is possible, both ends included.
+
+Crops also take images that still lie in a replay buffer (:class:`StoredImages`) and copy no more than the windows.
 """
 
 import inspect
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -19,7 +21,24 @@ from sb3_crc.settings import check_name
 ImageSize = int | tuple[int, int]
 
 
-def random_crop(images: th.Tensor, size: ImageSize, *, last_offset: bool = True) -> th.Tensor:
+class StoredImages(Protocol):
+    """Images ``(B, C, H, W)``, to be copied as a whole or window by window (:class:`~sb3_crc.buffers.store.FrameStacks`)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """``(B, C, H, W)``"""
+
+    def whole(self) -> th.Tensor:
+        """:return: the images"""
+
+    def windows(self, tops: th.Tensor, lefts: th.Tensor, size: tuple[int, int]) -> th.Tensor:
+        """:param tops: ``(B,)``; :param lefts: ``(B,)``; :param size: height and width; :return: ``(B, C, *size)``"""
+
+
+Images = th.Tensor | StoredImages
+
+
+def random_crop(images: Images, size: ImageSize, *, last_offset: bool = True) -> th.Tensor:
     """
     Cut a window at a random place out of each sample (RAD, arXiv 2004.14990; CURL, arXiv 2004.04136).
 
@@ -31,24 +50,29 @@ def random_crop(images: th.Tensor, size: ImageSize, *, last_offset: bool = True)
     """
     height, width = checked_size(images, size)
     batch, _, rows, columns = images.shape
-    tops = th.randint(max(1, rows - height + last_offset), (batch,)).tolist()
-    lefts = th.randint(max(1, columns - width + last_offset), (batch,)).tolist()
+    tops = th.randint(max(1, rows - height + last_offset), (batch,))
+    lefts = th.randint(max(1, columns - width + last_offset), (batch,))
+    if not isinstance(images, th.Tensor):
+        return images.windows(tops, lefts, (height, width))
     # Slices copy whole rows: four times faster on CPU than one advanced index, and offsets on the host need no device sync
-    corners = zip(images.unbind(), tops, lefts, strict=True)
+    corners = zip(images.unbind(), tops.tolist(), lefts.tolist(), strict=True)
     return th.stack([image[:, top : top + height, left : left + width] for image, top, left in corners])
 
 
-def center_crop(images: th.Tensor, size: ImageSize) -> th.Tensor:
+def center_crop(images: Images, size: ImageSize) -> th.Tensor:
     """
     Cut the window in the middle out of each sample: what the encoder does to frames that are larger than its input.
 
     :param images: ``(B, C, H, W)``, any type
     :param size: height and width of the window in pixels, or one number for both
-    :return: ``(B, C, *size)``, a view
+    :return: ``(B, C, *size)``, of a tensor a view
     :raises ValueError: if the window is larger than the images
     """
     height, width = checked_size(images, size)
     top, left = (images.shape[2] - height) // 2, (images.shape[3] - width) // 2
+    if not isinstance(images, th.Tensor):
+        batch = images.shape[0]
+        return images.windows(th.full((batch,), top), th.full((batch,), left), (height, width))
     return images[:, :, top : top + height, left : left + width]
 
 
@@ -89,7 +113,7 @@ def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None 
 
 
 def random_crop_overlay(
-    images: th.Tensor, size: ImageSize, *, last_offset: bool = True, alpha: float = 0.5, source: str | None = None
+    images: Images, size: ImageSize, *, last_offset: bool = True, alpha: float = 0.5, source: str | None = None
 ) -> th.Tensor:
     """
     :func:`random_crop`, then :func:`random_overlay` (the released code of CRC-RL).
@@ -121,7 +145,7 @@ def _pictures(source: str | None, size: tuple[int, int]) -> th.Tensor:
     return th.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).contiguous()
 
 
-def checked_size(images: th.Tensor, size: ImageSize) -> tuple[int, int]:
+def checked_size(images: Images, size: ImageSize) -> tuple[int, int]:
     """:return: ``size`` as height and width; :raises ValueError: if it is not within the images."""
     height, width = (size, size) if isinstance(size, int) else size
     if not (0 < height <= images.shape[2] and 0 < width <= images.shape[3]):
@@ -137,16 +161,18 @@ AUGMENTATIONS: dict[str, Callable[..., th.Tensor]] = {
     "random_overlay": random_overlay,
     "random_crop_overlay": random_crop_overlay,
 }
+#: Those that take StoredImages; the others are given tensors
+CROPS = {"random_crop", "center_crop", "random_crop_overlay"}
 
 
-def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ...]) -> Callable[[th.Tensor], th.Tensor]:
+def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ...]) -> Callable[[Images], th.Tensor]:
     """
     Give an augmentation its arguments, and try it on one black frame, rather than fail after the warm-up of a run.
 
     :param name: in :data:`AUGMENTATIONS`
     :param kwargs: its arguments
     :param shape: ``(C, H, W)`` of the frames
-    :return: maps uint8 ``(B, C, H, W)`` to uint8 images
+    :return: maps uint8 ``(B, C, H, W)``, stored or a tensor, to uint8 images
     :raises ValueError: for an unknown name or argument, or one that does not suit the frames
     """
     check_name("augmentation", name, AUGMENTATIONS)
@@ -159,7 +185,9 @@ def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ..
             augmentation(th.zeros(1, *shape, dtype=th.uint8))
         except TypeError as error:
             raise ValueError(f"augmentation_kwargs={dict(kwargs)} do not suit {name!r}: {error}") from error
-    return augmentation
+    if name in CROPS:
+        return augmentation
+    return lambda images: augmentation(images if isinstance(images, th.Tensor) else images.whole())
 
 
 def takes_size(augmentation: str) -> bool:

@@ -20,10 +20,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_crc.augmentations import AUGMENTATIONS, center_crop
-from sb3_crc.encoder import PixelEncoder, image_shape
+from sb3_crc.atomic import atomic_write
+from sb3_crc.augmentations import AUGMENTATIONS, Images, center_crop
+from sb3_crc.encoder import PixelEncoder
 from sb3_crc.extractors import ExtractorEncoder, checked_augmentation, trainable_extractor, trainable_parameters
-from sb3_crc.objectives import AuxiliaryObjective, ObjectiveSettings, build_objectives, objective_weights
+from sb3_crc.image_spaces import image_shape
+from sb3_crc.objectives import AuxiliaryObjective, ObjectiveSettings, build_objectives, objective_weights, reads_next
 from sb3_crc.schedules import lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
 from sb3_crc.views import Views
@@ -100,6 +102,7 @@ class AuxiliaryLearner:
         )
         self.objectives = build_objectives(settings.objectives, self._encoder, get_action_dim(model.action_space))
         self.objectives.to(model.device)
+        self._reads_next = reads_next(self.objectives, model.replay_buffer, getattr(model, "n_steps", 1))
         self._lr_schedule = lr_schedule(settings.learning_rate)
         self._parameters = {
             "encoder": trainable_parameters(self.extractor),
@@ -145,7 +148,7 @@ class AuxiliaryLearner:
         buffer = self.model.replay_buffer
         assert buffer is not None
         batch = buffer.sample(self.batch_size, env=self.model.get_vec_normalize_env())
-        views = Views(batch, self._augment, self._encoder, self._key, gamma=self.model.gamma)
+        views = Views(batch, self._augment, self._encoder, self._key, gamma=self.model.gamma, offers_next=self._reads_next)
         losses = {name: objective(views) for name, objective in self.objectives.items()}
         loss = th.stack([self.weights[name] * value for name, value in losses.items()]).sum()
 
@@ -168,7 +171,7 @@ class AuxiliaryLearner:
             metrics |= {f"representation/{name}_{key}": value for key, value in objective.metrics.items()}
         return metrics | {"representation/loss": loss}
 
-    def _augment(self, images: th.Tensor) -> th.Tensor:
+    def _augment(self, images: Images) -> th.Tensor:
         return center_crop(self._augmentation(images), self._encoder.input_shape[1:])  # a PixelEncoder may see less
 
     # -- On disk -------------------------------------------------------------------------------------------------------
@@ -204,11 +207,9 @@ class AuxiliaryLearner:
         tensors = {name: th.clone(value.detach().cpu(), memory_format=th.contiguous_format) for name, value in self._state()}
         target = aux_path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = target.with_name(target.name + ".tmp")
-        with zipfile.ZipFile(unfinished, "w") as archive:
+        with atomic_write(target) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
             archive.writestr("header.json", json.dumps(header, indent=2))
             archive.writestr("tensors.safetensors", safetensors.torch.save(tensors))
-        os.replace(unfinished, target)  # a crash leaves the old file or the new one, never half of one
         return target
 
     def _state(self) -> Iterable[tuple[str, th.Tensor]]:

@@ -2,28 +2,35 @@
 
 import io
 import pathlib
+from collections.abc import Iterable
 from inspect import signature
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.sac.sac import SAC
 from typing_extensions import Self
 
+from sb3_crc.atomic import atomic_write
+from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
+from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
 from sb3_crc.instruments import Speedometer
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
 from sb3_crc.saved_model import check_saved_model
 from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
+from sb3_crc.stacking import stacked_frame_channels
 
 
 class BaseCRCSAC(SAC):
     """What CRCSAC changes of SB3's SAC beside the algorithm itself; it does not train."""
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy, "MultiInputPolicy": CRCPolicy}
     policy: CRCPolicy
     actor: CRCActor
     critic: CRCCritic
@@ -32,11 +39,27 @@ class BaseCRCSAC(SAC):
     encoder_learning_rate: LearningRate | None
     ent_coef_learning_rate: LearningRate | None
     _env_steps: int | None = None
+    _frame_channels: int | None = None
     _speedometer: Speedometer
 
     def _setup_model(self) -> None:
         self._speedometer = Speedometer()
+        own = {name: getattr(self, name) for name in ("replay_buffer_class", "replay_buffer_kwargs", "n_steps")}
+        self._choose_replay_buffer()
         super()._setup_model()
+        vars(self).update(own)  # as the user gave them: load() compares the two
+
+    def _choose_replay_buffer(self) -> None:
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = DictFrameReplayBuffer if is_dict else FrameReplayBuffer
+        self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs or {})
+        if issubclass(self.replay_buffer_class, FrameReplayBuffer):
+            if self.env is not None:  # a model that is loaded without one has saved what it was
+                self._frame_channels = stacked_frame_channels(self.env)
+            derived = {"frame_channels": self._frame_channels, "n_steps": self.n_steps, "gamma": self.gamma}
+            self.replay_buffer_kwargs = derived | self.replay_buffer_kwargs
+            self.n_steps = 1  # SB3 would warn that a class it does not know ignores them
 
     def _setup_lr_schedule(self) -> None:
         self._lr_schedules: dict[str, FloatSchedule] = {}
@@ -49,11 +72,19 @@ class BaseCRCSAC(SAC):
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
             raise ValueError(
-                f"policy {policy_name!r} is not supported: {type(self).__name__} learns from images with 'CnnPolicy'; "
-                "of Dict observations give it the one image (a gymnasium ObservationWrapper), "
-                "for flat observations use stable_baselines3.SAC"
+                f"policy {policy_name!r} is not supported: {type(self).__name__} learns from images with 'CnnPolicy', from "
+                "Dict observations with one image with 'MultiInputPolicy'; for flat observations use stable_baselines3.SAC"
             )
         return super()._get_policy_from_name(policy_name)
+
+    def _check_policy_name(self, policy: object) -> None:
+        if self.env is None:  # load() gives it later
+            return
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        needed = "MultiInputPolicy" if is_dict else "CnnPolicy"
+        if isinstance(policy, str) and policy != needed:
+            kind = "Dict observations" if is_dict else "observations that are one image"
+            raise ValueError(f"policy {policy!r} does not suit {kind}: use {needed!r}")
 
     def _update_learning_rates(self) -> None:
         optimizers = {
@@ -84,6 +115,20 @@ class BaseCRCSAC(SAC):
             self.logger.record(f"time/{name}_per_second", rate)
         super().dump_logs()
 
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if isinstance(self.replay_buffer, FrameReplayBuffer):
+            self.replay_buffer.warn_if_too_large()
+            if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
+                self.replay_buffer.interrupt()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
     def learn(
         self,
         total_timesteps: int,
@@ -95,6 +140,46 @@ class BaseCRCSAC(SAC):
     ) -> Self:
         """As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """As in SB3, but a file appears whole or not at all: an interrupted save leaves the one that was there before."""
+        if isinstance(path, io.BufferedIOBase) or pathlib.Path(path).is_dir():  # SB3 has its own name for the latter
+            return super().save(path, exclude, include)
+        target = pathlib.Path(path)
+        target = target if target.suffix else target.with_name(f"{target.name}.zip")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(target) as unfinished:
+            super().save(unfinished, exclude, include)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer: as a folder of npy files, in which a later call adds only what is new; nothing is pickled.
+
+        :param path: of the folder; as in SB3 without an ending it gets ``.pkl``. Or a stream, which gets a zip of the same
+        """
+        if isinstance(self.replay_buffer, FrameReplayBuffer):
+            save_buffer_file(self.replay_buffer, path)
+        else:
+            super().save_replay_buffer(path)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer, also one that SB3 has pickled (unpickle only what you trust).
+
+        :param path: as for :meth:`save_replay_buffer`
+        :param truncate_last_traj: as in SB3
+        :raises FileNotFoundError: if there is none
+        :raises ValueError: if it is damaged or does not fit the model, whose buffer then stays as it was
+        """
+        if isinstance(self.replay_buffer, FrameReplayBuffer):
+            load_buffer_file(self.replay_buffer, path)
+        else:
+            super().load_replay_buffer(path, truncate_last_traj)
 
     @classmethod
     def load(
@@ -125,6 +210,7 @@ class BaseCRCSAC(SAC):
             "_objective_weights",
             "_collapse_alarm",
             "_speedometer",
+            "_reads_next",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

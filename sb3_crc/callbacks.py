@@ -23,6 +23,7 @@ from sb3_crc.auxiliary import AuxiliaryLearner, AuxiliarySettings, read_aux
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import scale_pixels
 from sb3_crc.extractors import trainable_extractor
+from sb3_crc.image_spaces import split_observations
 from sb3_crc.objectives import ObjectiveSettings, Reconstruction, objective_weights
 from sb3_crc.presets import PRESETS
 from sb3_crc.schedules import LearningRate, lr_schedule
@@ -204,7 +205,8 @@ class ReconstructionImageCallback(BaseCallback):
         modes = encoder.training, decoder.training
         encoder.train(False)
         decoder.train(False)
-        pixels = scale_pixels(center_crop(frames, encoder.input_shape[1:]))
+        images, _ = split_observations(frames, model.observation_space)
+        pixels = scale_pixels(center_crop(images, encoder.input_shape[1:]))
         with th.no_grad():
             decoded = decoder(encoder(pixels))  # (B, C, H, W)
         encoder.train(modes[0])

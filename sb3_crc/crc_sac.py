@@ -12,12 +12,13 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, bind_augmentation, center_crop, takes_size
+from sb3_crc.augmentations import AUGMENTATIONS, Images, ImageSize, bind_augmentation, center_crop, takes_size
 from sb3_crc.base_sac import BaseCRCSAC
-from sb3_crc.encoder import image_shape
+from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.finite import LossHistory
+from sb3_crc.image_spaces import image_shape, image_space
 from sb3_crc.instruments import CollapseAlarm, watched
-from sb3_crc.objectives import ObjectiveSettings, objective_weights
+from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
 from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
@@ -43,8 +44,9 @@ class CRCSAC(BaseCRCSAC):
 
     Arguments that are not listed are those of :class:`stable_baselines3.SAC`, with its defaults.
 
-    :param policy: ``"CnnPolicy"`` or a subclass of :class:`~sb3_crc.CRCPolicy`
-    :param env: environment with channel-first or -last uint8 images and continuous actions, or its id
+    :param policy: ``"CnnPolicy"``, for Dict observations ``"MultiInputPolicy"``, or a subclass of :class:`~sb3_crc.CRCPolicy`
+    :param env: environment with continuous actions and channel-first or -last uint8 images, or Dict observations with one such
+        image, to whose latent the vectors beside it are joined; or the environment's id
     :param learning_rate: of the actor; a number, a schedule of the remaining progress, or ``"lin_x"``: from x down to 0
     :param buffer_size: capacity of the replay buffer, in agent steps
     :param learning_starts: agent steps with random actions before the first update
@@ -123,6 +125,7 @@ class CRCSAC(BaseCRCSAC):
             _init_setup_model=False,
             **kwargs,
         )
+        self._check_policy_name(policy)
         del self.policy_kwargs["use_sde"]  # SB3 adds it; ours stays what the user gave, so that load() can compare the two
         self.encoder_tau = encoder_tau
         self.policy_delay = policy_delay
@@ -149,7 +152,7 @@ class CRCSAC(BaseCRCSAC):
         if self.use_sde or self.optimize_memory_usage:
             refused = "use_sde" if self.use_sde else "optimize_memory_usage"
             raise ValueError(f"{refused}=True is not supported by {type(self).__name__}")
-        image_shape(self.observation_space)
+        shape = image_shape(image_space(self.observation_space))
         check_ranges(self)
         for name, known in (("augmentation", tuple(AUGMENTATIONS)), ("anchor", ANCHORS), ("balance", BALANCES)):
             check_name(name, getattr(self, name), known)
@@ -168,26 +171,24 @@ class CRCSAC(BaseCRCSAC):
             "qf_lr_schedule": self._lr_schedules["qf_learning_rate"],
             "encoder_lr_schedule": self._lr_schedules["encoder_learning_rate"],
         }
-        own_buffer = self.replay_buffer_class, self.replay_buffer_kwargs
-        self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
         super()._setup_model()
         self.policy_kwargs = own_policy_kwargs
-        self.replay_buffer_class, self.replay_buffer_kwargs = own_buffer  # SB3 derives them from n_steps and gamma
+        self._reads_next = reads_next(self.policy.objectives, self.replay_buffer, self.n_steps)
 
         self._collapse_alarm = CollapseAlarm()
         size = self.policy.critic.features_extractor.input_shape[1:]
         sized = {"size": size} if takes_size(self.augmentation) else {}
         augmentation_kwargs = {**sized, **(self.augmentation_kwargs or {})}
-        self._augmentation = bind_augmentation(self.augmentation, augmentation_kwargs, image_shape(self.observation_space))
+        self._augmentation = bind_augmentation(self.augmentation, augmentation_kwargs, shape)
         with th.random.fork_rng(devices=[]):
-            self._augment(th.zeros(1, *image_shape(self.observation_space), dtype=th.uint8))
+            self._augment(th.zeros(1, *shape, dtype=th.uint8))
         if self.log_ent_coef is not None:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999))  # CURL's, as SAC+AE's
 
     def _network_input(self) -> ImageSize:
         if self.image_size is not None:
             return self.image_size
-        _, height, width = image_shape(self.observation_space)
+        _, height, width = image_shape(image_space(self.observation_space))
         ratio = CROP_RATIO if takes_size(self.augmentation) else 1
         return round(ratio * height), round(ratio * width)
 
@@ -237,7 +238,9 @@ class CRCSAC(BaseCRCSAC):
 
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
-        batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        buffer, normalize = self.replay_buffer, self._vec_normalize_env
+        sample = buffer.sample_frames if isinstance(buffer, FrameReplayBuffer) else buffer.sample
+        batch = sample(batch_size, env=normalize)
         return Views(
             batch,
             self._augment,
@@ -246,9 +249,10 @@ class CRCSAC(BaseCRCSAC):
             gamma=self.gamma,
             reward_scale=self.reward_scale,
             augment_anchor=self.anchor == "augmented",
+            offers_next=self._reads_next,
         )
 
-    def _augment(self, images: th.Tensor) -> th.Tensor:
+    def _augment(self, images: Images) -> th.Tensor:
         return center_crop(self._augmentation(images), self.critic.features_extractor.input_shape[1:])
 
     def _update_critic_and_encoder(self, views: Views) -> dict[str, th.Tensor]:
@@ -296,17 +300,19 @@ class CRCSAC(BaseCRCSAC):
         """Twin soft Q loss, 0.5 * sum over the heads of the mean squared Bellman error."""
         with th.no_grad():
             next_actions, next_log_prob = self.actor.view_log_prob(views.bootstrap)
-            next_q_values = self.critic_target.q_values(views.bootstrap.key_latent, next_actions)  # (B, n_critics)
+            bootstrap = views.bootstrap
+            next_q_values = self.critic_target.q_values(bootstrap.key_latent, next_actions, bootstrap.proprioception)
             next_values = next_q_values.min(dim=1, keepdim=True).values - self._temperature() * next_log_prob  # (B, 1)
             target_q_values = views.rewards + views.discounts * next_values
-        q_values = self.critic.q_values(views.anchor.latent, views.actions)  # (B, n_critics)
+        q_values = self.critic.q_values(views.anchor.latent, views.actions, views.anchor.proprioception)  # (B, n_critics)
         return 0.5 * (q_values - target_q_values).square().mean(dim=0).sum()
 
     def _update_actor_and_temperature(self, views: Views) -> dict[str, th.Tensor]:
         """Neither encoder nor Q heads receive gradient from the actor loss."""
-        actions, log_prob = self.actor.view_log_prob(views.anchor)
-        min_q_values = self.critic.q_values(views.anchor.latent.detach(), actions).min(dim=1, keepdim=True).values
-        actor_loss = (self._temperature() * log_prob - min_q_values).mean()
+        anchor = views.anchor
+        actions, log_prob = self.actor.view_log_prob(anchor)
+        q_values = self.critic.q_values(anchor.latent.detach(), actions, anchor.proprioception)  # (B, n_critics)
+        actor_loss = (self._temperature() * log_prob - q_values.min(dim=1, keepdim=True).values).mean()
         self._step(self.actor.optimizer, th.autograd.grad(actor_loss, _parameters(self.actor.optimizer)))
         metrics = {"train/actor_loss": actor_loss.detach(), "train/entropy": -log_prob.detach().mean()}
 

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Literal
 
-import psutil
+import numpy as np
 import torch as th
+from gymnasium.spaces import Box
 
+from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.envs.rendering import RenderingUnavailable, prove_backend
+from sb3_crc.memory import GIGABYTE, available_memory
 
 Verdict = Literal["ok", "note", "broken"]
 
 REQUIRED_PACKAGES = ("torch", "stable-baselines3", "gymnasium", "dm-control", "mujoco", "shimmy")
 OPTIONAL_PACKAGES = ("rl_zoo3",)
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "lavapipe")
-GIGABYTE = 1e9  # decimal, as in the papers' and SB3's figures
 
 FULL_BUFFER = (100_000, (9, 100, 100))
 """The paper's buffer: transitions, and the bytes of one observation."""
@@ -120,47 +120,10 @@ def examine_memory() -> Iterator[Finding]:
     available = available_memory()
     yield Finding("memory", "available", f"{available / GIGABYTE:.1f} GB")
     for name, (transitions, shape) in (("paper's buffer", FULL_BUFFER), ("laptop buffer", LAPTOP_BUFFER)):
-        needed = replay_buffer_bytes(transitions, shape)
+        space = Box(0, 255, shape, np.uint8)
+        buffer = FrameReplayBuffer(transitions, space, Box(-1, 1, (1,)), device="cpu", frame_channels=3)  # takes no memory yet
+        needed = buffer.full_bytes
         fits = needed < available
         size = " x ".join(map(str, shape))
-        value = f"{needed / GIGABYTE:.1f} GB for {transitions:,} transitions of {size} bytes, twice (obs and next_obs)"
+        value = f"{needed / GIGABYTE:.1f} GB for {transitions:,} transitions of {size} bytes"
         yield Finding("memory", name, value if fits else f"{value}: does not fit", "ok" if fits else "note")
-
-
-def replay_buffer_bytes(transitions: int, observation_shape: tuple[int, ...]) -> int:
-    """Memory of the observations in a full SB3 ReplayBuffer, which keeps obs and next_obs of every transition.
-
-    :param transitions: capacity (buffer_size)
-    :param observation_shape: of one byte observation, for instance (9, 100, 100)
-    :return: bytes; actions, rewards and dones add less than a thousandth for pictures
-    """
-    return 2 * transitions * math.prod(observation_shape)
-
-
-def available_memory(control_groups: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes this process can still allocate: the machine's free memory, or what a container's limit leaves if that is less.
-
-    :param control_groups: where the kernel shows the process's control group (version 2, or version 1 under ``memory/``)
-    """
-    available = psutil.virtual_memory().available
-    for limit, usage, cache in (
-        ("memory.max", "memory.current", "inactive_file"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
-    ):
-        try:
-            allowed = int((control_groups / limit).read_text(encoding="ascii"))
-            used = int((control_groups / usage).read_text(encoding="ascii"))
-        except (OSError, ValueError):  # no such group, or the limit reads "max"
-            continue
-        # The page cache counts as used but is given back under pressure.
-        reclaimable = _read_statistic((control_groups / limit).parent / "memory.stat", cache)
-        available = min(available, max(0, allowed - used + reclaimable))
-    return available
-
-
-def _read_statistic(path: Path, name: str) -> int:
-    try:
-        lines = path.read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith(f"{name} ")), 0)

@@ -3,21 +3,20 @@
 B batch, C channels (of the whole frame stack), H, W image height and width, F flattened convolution output, Z latent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import (
-    is_image_space,
-    is_image_space_channels_first,
-)
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_crc.augmentations import ImageSize, center_crop
+from sb3_crc.image_spaces import image_shape, image_space, split_observations
 from sb3_crc.settings import check_name
 
+#: A batch of images, or a mapping in which there is one
+Observations = th.Tensor | Mapping[str, th.Tensor]
 LATENT_ACTIVATIONS: dict[str, type[nn.Module]] = {"none": nn.Identity, "tanh": nn.Tanh}
 
 
@@ -28,7 +27,7 @@ class PixelEncoder(BaseFeaturesExtractor):
     It takes bytes, which it scales to [0, 1] itself, or floats that are scaled already (as SB3 hands them to any features
     extractor), and cuts the middle out of images that are larger than ``image_size``.
 
-    :param observation_space: channel-first uint8 images ``(C, H, W)``
+    :param observation_space: channel-first uint8 images ``(C, H, W)``, or a Dict with one such image, which alone is encoded
     :param features_dim: latent dimension Z
     :param image_size: height and width of the input of the convolutions in pixels (one number: both); None: the whole image
     :param channels: filters of each convolution
@@ -51,7 +50,7 @@ class PixelEncoder(BaseFeaturesExtractor):
         latent_activation: str = "none",
         center_input: bool = False,
     ):
-        frame_stack, *frame_size = image_shape(observation_space)
+        frame_stack, *frame_size = image_shape(image_space(observation_space))
         super().__init__(observation_space, features_dim)
         if len(channels) != len(strides):
             raise ValueError(f"channels={tuple(channels)} and strides={tuple(strides)} must have the same length")
@@ -86,13 +85,19 @@ class PixelEncoder(BaseFeaturesExtractor):
         self.apply(init_orthogonal)
         self.convolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # 3x faster on CPU
 
-    def forward(self, observations: th.Tensor) -> th.Tensor:
+    @property
+    def observation_space(self) -> spaces.Space[Any]:
+        """What observations it was built for."""
+        return self._observation_space
+
+    def forward(self, observations: Observations) -> th.Tensor:
         """:param observations: ``(B, C, H, W)``, uint8 or floats in [0, 1]; :return: latents ``(B, Z)``"""
         return self.project(self.convolve(observations))
 
-    def convolve(self, observations: th.Tensor) -> th.Tensor:
+    def convolve(self, observations: Observations) -> th.Tensor:
         """:param observations: ``(B, C, H, W)``, uint8 or floats in [0, 1]; :return: convolution output ``(B, F)``"""
-        images = center_crop(observations, self.input_shape[1:])
+        images, _ = split_observations(observations, self.observation_space)
+        images = center_crop(images, self.input_shape[1:])
         pixels = scale_pixels(images) if images.dtype == th.uint8 else images.contiguous(memory_format=th.channels_last)
         if self.center_input:
             pixels = pixels - 0.5
@@ -118,30 +123,6 @@ def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.
 def scale_pixels(images: th.Tensor) -> th.Tensor:
     """The one place where bytes become floats. :return: float32 in [0, 1], channels last in memory"""
     return images.to(th.float32, memory_format=th.channels_last).div_(255.0)
-
-
-def image_shape(observation_space: spaces.Space[Any]) -> tuple[int, ...]:
-    """
-    :return: ``(C, H, W)`` of a space of byte images
-    :raises ValueError: if the space is anything else
-    """
-    if not is_image_space(observation_space) or not is_image_space_channels_first(observation_space):  # type: ignore[arg-type]
-        if isinstance(observation_space, spaces.Dict):
-            hint = "; of Dict observations choose one image (a gymnasium ObservationWrapper)"
-        elif observation_space.shape is not None and len(observation_space.shape) == 3:
-            hint = "; if a VecNormalize is around the environment, give it norm_obs=False"
-        else:
-            hint = ""
-        raise ValueError(
-            f"expected uint8 images (channels, height, width) with values in [0, 255], got {observation_space}{hint}"
-        )
-    assert observation_space.shape is not None
-    channels, *size = observation_space.shape
-    if channels >= min(size):
-        raise ValueError(
-            f"channels must be fewer than rows and columns, got {observation_space.shape} as (channels, rows, columns)"
-        )
-    return observation_space.shape
 
 
 def smallest_input(strides: Sequence[int], kernel_size: int) -> int:

@@ -3,13 +3,19 @@
 T length of an episode in agent steps, A action.
 """
 
+import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
+
+Observation = np.ndarray | dict[str, np.ndarray]
 
 
 class QBiasEvalCallback(EvalCallback):
@@ -27,13 +33,35 @@ class QBiasEvalCallback(EvalCallback):
 
     def _init_callback(self) -> None:
         super()._init_callback()
-        self._episodes: dict[int, list[tuple[np.ndarray, np.ndarray, float]]] = {}
+        self._episodes: dict[int, list[tuple[Observation, np.ndarray, float]]] = {}
         self._biases: list[tuple[float, float]] = []
 
     def _on_step(self) -> bool:
         self._biases = []
         self._episodes = {}
-        return super()._on_step()
+        if self.log_path is None or self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return super()._on_step()
+        # SB3's own writing, which Ctrl-C may cut short, goes nowhere; what is evaluated by then is written whole
+        log_path, self.log_path = self.log_path, io.BytesIO()  # type: ignore[assignment]
+        try:
+            return super()._on_step()
+        finally:
+            self.log_path = log_path
+            self._write_evaluations()
+
+    def _write_evaluations(self) -> None:
+        records: dict[str, list[Any]] = {
+            "timesteps": self.evaluations_timesteps,
+            "results": self.evaluations_results,
+            "ep_lengths": self.evaluations_length,
+        }
+        complete = min(len(values) for values in records.values())
+        arrays = {name: np.array(values[:complete]) for name, values in records.items()}
+        if self.evaluations_successes:
+            arrays["successes"] = np.array(self.evaluations_successes)
+        if complete > 0:
+            with atomic_write(Path(f"{self.log_path}.npz")) as unfinished, unfinished.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         """Called by ``evaluate_policy`` after each step of each environment."""
@@ -41,7 +69,8 @@ class QBiasEvalCallback(EvalCallback):
         if not isinstance(self.model, CRCSAC):
             return
         index, info = locals_["i"], locals_["info"]
-        step = locals_["observations"][index], locals_["actions"][index], float(locals_["reward"])
+        observation = _rows(locals_["observations"], index)
+        step = observation, locals_["actions"][index], float(locals_["reward"])
         self._episodes.setdefault(index, []).append(step)
         if locals_["done"]:
             truncated = info.get("TimeLimit.truncated", False)
@@ -54,7 +83,7 @@ class QBiasEvalCallback(EvalCallback):
 
 
 def q_value_and_soft_return(
-    model: CRCSAC, episode: list[tuple[np.ndarray, np.ndarray, float]], last: np.ndarray | None
+    model: CRCSAC, episode: list[tuple[Observation, np.ndarray, float]], last: Observation | None
 ) -> tuple[float, float]:
     """
     :param model: whose critic and actor are asked
@@ -63,22 +92,35 @@ def q_value_and_soft_return(
     :return: min Q(s_0, a_0), and the discounted soft return of the episode
     """
     observations, actions, rewards = zip(*episode, strict=True)
-    frames = np.stack([*observations, *([] if last is None else [last])])
+    frames = _stack([*observations, *([] if last is None else [last])])
+    n_frames = len(rewards) + (last is not None)
     policy, device = model.policy, model.device
     state = th.get_rng_state()  # evaluating must not change the run's random numbers
     with th.no_grad():
         taken = th.as_tensor(policy.scale_action(np.stack(actions[:1])), dtype=th.float32, device=device)
-        q_value = th.cat(policy.critic(th.as_tensor(frames[:1], device=device), taken)).min()
+        q_value = th.cat(policy.critic(obs_as_tensor(_rows(frames, slice(1)), device), taken)).min()
         entropies, value = [], th.zeros(())
-        for chunk in np.array_split(frames, max(1, len(frames) // 128)):
-            images = th.as_tensor(chunk, device=device)
-            drawn, log_prob = policy.actor.action_log_prob(images)
+        for chunk in np.array_split(np.arange(n_frames), max(1, n_frames // 128)):
+            seen = obs_as_tensor(_rows(frames, chunk), device)
+            drawn, log_prob = policy.actor.action_log_prob(seen)
             entropies.append(-model._temperature() * log_prob)
             if last is not None:  # of the last chunk its last frame counts
-                value = th.cat(policy.critic(images[-1:], drawn[-1:])).min() + entropies[-1][-1]
+                value = th.cat(policy.critic(_rows(seen, slice(-1, None)), drawn[-1:])).min() + entropies[-1][-1]
     th.set_rng_state(state)
     soft_rewards = model.reward_scale * np.array(rewards)
     soft_rewards[1:] += th.cat(entropies).cpu().numpy()[1 : len(rewards)]
     discounts = model.gamma ** np.arange(len(rewards))
     soft_return = float(discounts @ soft_rewards) + model.gamma ** len(rewards) * float(value)
     return float(q_value), soft_return
+
+
+def _rows(observations: Any, rows: Any) -> Any:
+    if isinstance(observations, dict):
+        return {key: values[rows] for key, values in observations.items()}
+    return observations[rows]
+
+
+def _stack(observations: list[Any]) -> Any:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)

@@ -14,9 +14,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_crc.augmentations import bind_augmentation
+from sb3_crc.augmentations import Images, bind_augmentation
 from sb3_crc.crc_sac import CRCSAC
-from sb3_crc.encoder import PixelEncoder, image_shape
+from sb3_crc.encoder import PixelEncoder
+from sb3_crc.image_spaces import image_shape
 from sb3_crc.objectives import Reconstruction
 
 #: The networks whose features extractor is trained: of SAC, TD3, DDPG, TQC; of DQN; of sb3-contrib's QR-DQN.
@@ -37,6 +38,7 @@ class ExtractorEncoder:
 
     def __init__(self, extractor: BaseFeaturesExtractor, observation_space: spaces.Space[Any], normalize_images: bool):
         self.extractor = extractor
+        self.observation_space = observation_space
         self.normalize_images = normalize_images
         self.features_dim = extractor.features_dim
         mirrored = extractor if isinstance(extractor, PixelEncoder) else None
@@ -92,7 +94,7 @@ def trainable_extractor(model: BaseAlgorithm) -> BaseFeaturesExtractor:
 
 def checked_augmentation(
     name: str, kwargs: Mapping[str, Any], shape: tuple[int, ...], input_shape: tuple[int, ...]
-) -> Callable[[th.Tensor], th.Tensor]:
+) -> Callable[[Images], th.Tensor]:
     """
     :param name: in :data:`~sb3_crc.augmentations.AUGMENTATIONS`
     :param kwargs: its arguments

@@ -2,6 +2,7 @@
 
 import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,13 @@ class LossHistory:
         batch = buffer.sample(batch_size, env=env)
         target = Path(folder or tempfile.gettempdir()) / f"not_finite_at_update_{update}"
         target.mkdir(parents=True, exist_ok=True)
-        tensors = {key: tensor.cpu() for key, tensor in batch._asdict().items() if tensor is not None}
-        th.save({**tensors, "torch_rng_state": torch_state}, target / "batch.pt")
+        th.save({**_on_host(batch._asdict()), "torch_rng_state": torch_state}, target / "batch.pt")
         raise FloatingPointError(
             f"{name} is {value} at update {update}, agent step {agent_step}: the weights are lost, go on from the last "
             f"checkpoint; the update's batch is saved in {target}"
         )
+
+
+def _on_host(values: Mapping[str, Any]) -> dict[str, Any]:
+    present = {key: value for key, value in values.items() if value is not None}
+    return {key: _on_host(value) if isinstance(value, Mapping) else value.cpu() for key, value in present.items()}

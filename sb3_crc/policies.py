@@ -1,6 +1,6 @@
 """Who owns, shares and detaches which weights.
 
-B batch, F flattened convolution output, Z latent, A action.
+B batch, F flattened convolution output, Z latent, P proprioception, A action.
 
 ======================== ============================ ================================ ========================
 weights                  trained by                   gradient of                      followed by
@@ -12,6 +12,8 @@ objectives               encoder_optimizer            objectives
 actor (own projection    actor.optimizer              actor loss
 and heads)
 ======================== ============================ ================================ ========================
+
+Of Dict observations the image is encoded, and proprioception (the vectors beside it) joins the latent at the heads.
 """
 
 from typing import Any
@@ -28,6 +30,7 @@ from torch import nn
 from typing_extensions import Self
 
 from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
+from sb3_crc.image_spaces import proprioception_dim, split_observations
 from sb3_crc.objectives import ObjectiveSettings, build_objectives
 from sb3_crc.settings import check_name
 from sb3_crc.views import View
@@ -72,7 +75,8 @@ class CRCActor(Actor):
         self.projection: nn.Module = nn.Identity()
         if actor_features == "conv":
             self.projection = latent_projection(encoder.convolution_dim, self.features_dim, encoder.latent_activation)
-        self.latent_pi = _heads_mlp(self.features_dim, -1, self.net_arch, self.activation_fn, layer_norm)
+        inputs = self.features_dim + proprioception_dim(self.observation_space)
+        self.latent_pi = _heads_mlp(inputs, -1, self.net_arch, self.activation_fn, layer_norm)
         for module in self.own_modules():
             module.apply(init_orthogonal)
 
@@ -86,13 +90,13 @@ class CRCActor(Actor):
         return [parameter for module in self.own_modules() for parameter in module.parameters()]
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        """:param obs: images ``(B, C, H, W)``, uint8; :return: mean and log std ``(B, A)``, and an empty dict"""
-        assert isinstance(obs, th.Tensor)
+        """:param obs: images ``(B, C, H, W)``, uint8, or a mapping with such; :return: mean and log std ``(B, A)``, and {}"""
         with th.no_grad():  # the encoder is not the actor's to train
             features = self.features_extractor.convolve(obs)
             if self.actor_features == "latent":
                 features = self.features_extractor.project(features)
-        mean_actions, log_std = self._dist_params(features)
+        _, proprioception = split_observations(obs, self.observation_space)
+        mean_actions, log_std = self._dist_params(features, proprioception)
         return mean_actions, log_std, {}
 
     def view_log_prob(self, view: View) -> tuple[th.Tensor, th.Tensor]:
@@ -103,11 +107,11 @@ class CRCActor(Actor):
         """
         features = view.features if self.actor_features == "conv" else view.latent
         assert isinstance(self.action_dist, SquashedDiagGaussianDistribution)
-        actions, log_prob = self.action_dist.log_prob_from_params(*self._dist_params(features.detach()))
+        actions, log_prob = self.action_dist.log_prob_from_params(*self._dist_params(features.detach(), view.proprioception))
         return actions, log_prob.unsqueeze(1)
 
-    def _dist_params(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        latent_pi = self.latent_pi(self.projection(features))
+    def _dist_params(self, features: th.Tensor, proprioception: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
+        latent_pi = self.latent_pi(_beside(self.projection(features), proprioception))
         low, high = self.log_std_bounds
         assert isinstance(self.log_std, nn.Linear)
         log_std = low + 0.5 * (high - low) * (th.tanh(self.log_std(latent_pi)) + 1)
@@ -152,19 +156,23 @@ class CRCCritic(ContinuousCritic):
         )
         self.q_networks = []
         for index in range(n_critics):
-            inputs = features_dim + get_action_dim(action_space)
+            inputs = features_dim + proprioception_dim(observation_space) + get_action_dim(action_space)
             head = _heads_mlp(inputs, 1, net_arch, activation_fn, layer_norm).apply(init_orthogonal)
             self.add_module(f"qf{index}", head)
             self.q_networks.append(head)
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        """:param obs: images ``(B, C, H, W)``, uint8, scaled by the encoder; :return: latents ``(B, Z)``"""
-        latents: th.Tensor = features_extractor(obs)
-        return latents
+        """:param obs: images ``(B, C, H, W)``, uint8, or a mapping with such; :return: what the heads see, ``(B, Z + P)``"""
+        return _beside(features_extractor(obs), split_observations(obs, self.observation_space)[1])
 
-    def q_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """:param latents: ``(B, Z)``; :param actions: ``(B, A)``; :return: ``(B, n_critics)``"""
-        inputs = th.cat([latents, actions], dim=1)
+    def q_values(self, latents: th.Tensor, actions: th.Tensor, proprioception: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param latents: ``(B, Z)``
+        :param actions: ``(B, A)``
+        :param proprioception: ``(B, P)``; None for observations that are an image alone
+        :return: ``(B, n_critics)``
+        """
+        inputs = th.cat([_beside(latents, proprioception), actions], dim=1)
         return th.cat([head(inputs) for head in self.q_networks], dim=1)
 
     def head_parameters(self) -> list[nn.Parameter]:
@@ -176,7 +184,7 @@ class CRCPolicy(SACPolicy):
     """
     SAC's policy with one encoder for critic, actor and objectives, and its moving average as target and key encoder.
 
-    :param observation_space: channel-first uint8 images
+    :param observation_space: channel-first uint8 images, or a Dict with one such image and vectors
     :param action_space: a Box
     :param lr_schedule: of the actor
     :param net_arch: hidden layers of the heads, as in SB3; default ``[1024, 1024]`` (CRC-RL)
@@ -310,6 +318,10 @@ class CRCPolicy(SACPolicy):
         for fixed in ("use_sde", "log_std_init", "use_expln", "clip_mean"):
             del data[fixed]
         return {**data, **self._own_kwargs}
+
+
+def _beside(latents: th.Tensor, proprioception: th.Tensor | None) -> th.Tensor:
+    return latents if proprioception is None else th.cat([latents, proprioception], dim=1)
 
 
 def _heads_mlp(

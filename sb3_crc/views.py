@@ -10,6 +10,8 @@ positive   o_t, augmented anew           no          yes            key of the c
                                                                     loss
 clean      the middle of o_t             no          yes            target of the consistency loss with its predictor
                                                                     on the online side (``crc_release``)
+next       augmented o_{t+1}             yes,        yes            objectives that declare ``reads_next``; none of ours
+                                         detached
 bootstrap  augmented o_{t+n}             yes,        yes            next actions (online), Q targets (key encoder)
                                          detached
 ========== ============================= =========== ============== ===================================================
@@ -20,17 +22,20 @@ and only ``crc_release`` a clean view. With ``anchor="center_crop"`` the anchor 
 actor is updated too.
 
 B batch, C channels (of the whole frame stack), H, W height and width of the encoder's input, F flattened convolution
-output, Z latent, A action.
+output, Z latent, P proprioception, A action. With ``n_steps=1``, next and bootstrap are one view.
 """
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import torch as th
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 
-from sb3_crc.augmentations import center_crop
+from sb3_crc.augmentations import Images, center_crop
+from sb3_crc.buffers.samples import FrameSamples
 from sb3_crc.encoder import PixelEncoder, scale_pixels
+from sb3_crc.image_spaces import split_observations
 
 
 class View:
@@ -45,10 +50,20 @@ class View:
     :param encoder: the online encoder
     :param key_encoder: its exponential moving average
     :param trains_encoder: keep the graph of the online encoding
+    :param proprioception: what was observed beside the images, ``(B, P)``, or None
     """
 
-    def __init__(self, images: th.Tensor, encoder: PixelEncoder, key_encoder: PixelEncoder, *, trains_encoder: bool):
+    def __init__(
+        self,
+        images: th.Tensor,
+        encoder: PixelEncoder,
+        key_encoder: PixelEncoder,
+        *,
+        trains_encoder: bool,
+        proprioception: th.Tensor | None = None,
+    ):
         self.images = images
+        self.proprioception = proprioception
         self._encoder = encoder
         self._key_encoder = key_encoder
         self._trains_encoder = trains_encoder
@@ -120,31 +135,35 @@ class Views:
     """
     What one update sees of a sampled batch.
 
-    :param batch: a sample of the replay buffer, images on the training device as uint8
+    :param batch: a sample of the replay buffer, images on the training device as uint8, or still in the buffer
     :param augment: maps uint8 ``(B, C, *, *)`` to uint8 of the encoder's input size, anew at each call
     :param encoder: the online encoder
     :param key_encoder: its exponential moving average
     :param gamma: discount for buffers that return none of their own
     :param reward_scale: factor on the rewards
     :param augment_anchor: False: the anchor is the middle of o_t (the literal reading of CRC-RL's consistency section)
+    :param offers_next: an objective has declared that it reads ``next``
     """
 
     def __init__(
         self,
-        batch: ReplayBufferSamples,
-        augment: Callable[[th.Tensor], th.Tensor],
+        batch: ReplayBufferSamples | DictReplayBufferSamples | FrameSamples,
+        augment: Callable[[Images], th.Tensor],
         encoder: PixelEncoder,
         key_encoder: PixelEncoder,
         *,
         gamma: float = 0.99,
         reward_scale: float = 1.0,
         augment_anchor: bool = True,
+        offers_next: bool = False,
     ):
         self._batch = batch
         self._augment = augment
         self._encoders = encoder, key_encoder
         self._size = encoder.input_shape[1:]
+        self._observation_space = encoder.observation_space
         self._augment_anchor = augment_anchor
+        self._offers_next = offers_next
         self.actions = batch.actions  # (B, A)
         self.rewards = batch.rewards * reward_scale  # (B, 1)
         discounts = gamma if batch.discounts is None else batch.discounts
@@ -154,22 +173,36 @@ class Views:
     def anchor(self) -> View:
         """Augmented o_t, the one view whose online encoding carries gradients."""
         augment = self._augment if self._augment_anchor else self._middle
-        return View(augment(self._batch.observations), *self._encoders, trains_encoder=True)
+        return self._view(self._batch.observations, augment, trains_encoder=True)
 
     @cached_property
     def positive(self) -> View:
         """o_t again, augmented independently of the anchor."""
-        return View(self._augment(self._batch.observations), *self._encoders, trains_encoder=False)
+        return self._view(self._batch.observations, self._augment)
 
     @cached_property
     def clean(self) -> View:
         """The middle of o_t, not augmented."""
-        return View(self._middle(self._batch.observations), *self._encoders, trains_encoder=False)
+        return self._view(self._batch.observations, self._middle)
+
+    @cached_property
+    def next(self) -> View:
+        """Augmented o_{t+1}."""
+        if not self._offers_next:
+            raise RuntimeError("an objective that reads views.next must declare it: reads_next = True in its class")
+        observations = getattr(self._batch, "one_step_observations", self._batch.next_observations)
+        if observations is self._batch.next_observations:
+            return self.bootstrap
+        return self._view(observations, self._augment)
 
     @cached_property
     def bootstrap(self) -> View:
         """Augmented o_{t+n}, from which the return is bootstrapped."""
-        return View(self._augment(self._batch.next_observations), *self._encoders, trains_encoder=False)
+        return self._view(self._batch.next_observations, self._augment)
 
-    def _middle(self, images: th.Tensor) -> th.Tensor:
+    def _view(self, observations: Any, augment: Callable[[Images], th.Tensor], *, trains_encoder: bool = False) -> View:
+        images, proprioception = split_observations(observations, self._observation_space)
+        return View(augment(images), *self._encoders, trains_encoder=trains_encoder, proprioception=proprioception)
+
+    def _middle(self, images: Images) -> th.Tensor:
         return center_crop(images, self._size)

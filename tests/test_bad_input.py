@@ -89,14 +89,22 @@ def test_observations_that_are_not_byte_images_are_refused(space: Any, message: 
         construct(SpacesEnv(space), image_size=image_size)
 
 
-@pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
+SPEED = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
 @pytest.mark.parametrize("settings", [{}, {"n_steps": 3, "image_size": 30}])
-def test_dict_observations_are_refused_with_the_way_out(policy: str, settings: dict[str, Any]) -> None:
-    """SB3 sends CnnPolicy's users to MultiInputPolicy, which this algorithm does not have."""
-    env = SpacesEnv(gym.spaces.Dict(image=images(3, 40, 40), speed=gym.spaces.Box(-1, 1, (2,), np.float32)))
-    with pytest.raises(ValueError, match=r"Dict.*(one image|single image)") as error:
-        CRCSAC(policy, env, buffer_size=50, **settings)
-    assert "must use `MultiInputPolicy`" not in str(error.value)
+def test_the_policy_must_suit_the_observations(settings: dict[str, Any]) -> None:
+    env = SpacesEnv(gym.spaces.Dict(image=images(3, 40, 40), speed=SPEED))
+    with pytest.raises(ValueError, match=r"CnnPolicy.*Dict.*MultiInputPolicy"):
+        CRCSAC("CnnPolicy", env, buffer_size=50, **settings)
+    with pytest.raises(ValueError, match=r"MultiInputPolicy.*one image.*CnnPolicy"):
+        CRCSAC("MultiInputPolicy", SpacesEnv(images(3, 40, 40)), buffer_size=50, **settings)
+
+
+@pytest.mark.parametrize("spaces", [{"speed": SPEED}, {"left": images(3, 40, 40), "right": images(3, 40, 40)}])
+def test_dict_observations_have_exactly_one_image(spaces: dict[str, gym.Space[Any]]) -> None:
+    with pytest.raises(ValueError, match=r"expected one uint8 image.*found (none|2 \(left, right\))"):
+        CRCSAC("MultiInputPolicy", SpacesEnv(gym.spaces.Dict(spaces)), buffer_size=50)
 
 
 @pytest.mark.parametrize("space", [gym.spaces.Discrete(3), gym.spaces.MultiBinary(2), gym.spaces.MultiDiscrete([2, 2])])
@@ -276,15 +284,15 @@ def test_a_loss_that_is_not_finite_stops_the_training(place: str, term: str, gra
         model._update_actor_and_temperature = lambda views: {**update(views), "train/actor_loss": th.tensor(NAN)}
 
     sampled: list[Any] = []
-    sample = model.replay_buffer.sample
-    model.replay_buffer.sample = lambda *args, **kwargs: sampled.append(sample(*args, **kwargs)) or sampled[-1]
+    sample = model.replay_buffer.sample_frames
+    model.replay_buffer.sample_frames = lambda *args, **kwargs: sampled.append(sample(*args, **kwargs)) or sampled[-1]
     with pytest.raises(FloatingPointError, match=rf"{term}.*(nan|inf).*update 4.*agent step 40.*saved in ") as error:
         model.train(gradient_steps=gradient_steps, batch_size=16)
     folder = Path(str(error.value).rpartition("saved in ")[2])
     assert folder.is_dir() and tmp_path in folder.parents
     saved = th.load(folder / "batch.pt", weights_only=True)
     for name in ("observations", "actions", "next_observations", "dones", "rewards"):
-        assert th.equal(saved[name], getattr(sampled[0], name)), name
+        assert th.equal(saved[name], getattr(sampled[0].whole(), name)), name
 
 
 def test_rewards_of_nan_are_blamed_on_the_critic_loss_and_not_on_the_action(tmp_path: Path) -> None:

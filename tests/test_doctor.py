@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
-from stable_baselines3.common.buffers import ReplayBuffer
 from typer.testing import CliRunner
 
 from sb3_crc import doctor
 from sb3_crc.cli import app
-from sb3_crc.doctor import available_memory, examine, examine_memory, replay_buffer_bytes
+from sb3_crc.buffers import FrameReplayBuffer
+from sb3_crc.doctor import FULL_BUFFER, examine, examine_memory
+from sb3_crc.memory import available_memory
 from sb3_crc.envs import rendering
 from sb3_crc.envs.rendering import RenderingUnavailable
 
@@ -28,10 +29,13 @@ def test_every_topic_is_looked_at() -> None:
         assert 0 < float(by_name[name].split(" ms")[0]) < 1000
 
 
-def test_buffer_formula_is_what_sb3_allocates() -> None:
-    buffer = ReplayBuffer(50, Box(0, 255, (9, 20, 20), np.uint8), Box(-1, 1, (1,)), device="cpu")
-    assert replay_buffer_bytes(50, (9, 20, 20)) == buffer.observations.nbytes + buffer.next_observations.nbytes
-    assert replay_buffer_bytes(100_000, (9, 100, 100)) == 18_000_000_000
+def test_buffer_figures_are_what_full_buffers_take() -> None:
+    findings = {finding.name: finding.value for finding in examine_memory()}
+    assert findings["paper's buffer"].startswith("3.0 GB for 100,000 transitions of 9 x 100 x 100 bytes")
+    transitions, shape = FULL_BUFFER
+    buffer = FrameReplayBuffer(transitions // 1000, Box(0, 255, shape, np.uint8), Box(-1, 1, (1,)), frame_channels=3)
+    memory = buffer.store.allocate()
+    assert memory.numel() * memory.element_size() == buffer.full_bytes
 
 
 def test_a_buffer_that_does_not_fit_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:

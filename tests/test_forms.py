@@ -151,7 +151,7 @@ def test_the_cosine_with_the_critics_gradient_is_logged() -> None:
 def test_anchor_center_crop_is_not_augmented() -> None:
     model = make_model(anchor="center_crop")
     batch = model.replay_buffer.sample(16)
-    model.replay_buffer.sample = lambda batch_size, env=None: batch
+    model.replay_buffer.sample_frames = lambda batch_size, env=None: batch
     views = model._sample_views(16)
     assert th.equal(views.anchor.images, center_crop(batch.observations, 34))
     assert not th.equal(views.positive.images, center_crop(batch.observations, 34))

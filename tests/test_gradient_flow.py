@@ -140,7 +140,7 @@ def test_the_view_table_holds() -> None:
     for name, network in (("online", model.critic.features_extractor), ("key", model.policy.key_encoder)):
         network.convolutions.register_forward_pre_hook(lambda module, args, name=name: seen[name].append(args[0] * 255))
     batch = model.replay_buffer.sample(16)
-    model.replay_buffer.sample = lambda batch_size, env=None: batch
+    model.replay_buffer.sample_frames = lambda batch_size, env=None: batch
     model.train(gradient_steps=2, batch_size=16)
 
     def source(pixels: th.Tensor) -> str:

@@ -91,7 +91,9 @@ def test_one_transfer_from_the_device_per_call(monkeypatch: pytest.MonkeyPatch) 
 
         monkeypatch.setattr(th.Tensor, name, read)
 
-    monkeypatch.setattr(model, "_augment", lambda images: images[:, :, 3:37, 3:37])  # crop offsets are drawn on the host
+    batch = model.replay_buffer.sample(16)  # whose rows are drawn, and its crops, on the host
+    monkeypatch.setattr(model.replay_buffer, "sample_frames", lambda *args, **kwargs: batch)
+    monkeypatch.setattr(model, "_augment", lambda images: images[:, :, 3:37, 3:37])
     for name in ("item", "tolist", "numpy", "cpu", "__bool__", "__float__", "__int__"):
         spy(name)
     model.train(gradient_steps=4, batch_size=16)

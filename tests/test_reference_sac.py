@@ -88,7 +88,7 @@ def test_twenty_updates_equal_the_reference() -> None:
     expected = [reference.update(batch) for batch in batches]
     th.manual_seed(3)
     feed = iter(batches)
-    model.replay_buffer.sample = lambda batch_size, env=None: next(feed)
+    model.replay_buffer.sample_frames = lambda batch_size, env=None: next(feed)
     for losses in expected:
         model.train(gradient_steps=1, batch_size=16)
         for name, value in losses.items():

@@ -7,8 +7,10 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
+from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives.base import AuxiliaryObjective
 from sb3_crc.objectives.consistency import Consistency, consistency_loss
@@ -26,6 +28,7 @@ __all__ = [
     "consistency_loss",
     "info_nce",
     "objective_weights",
+    "reads_next",
     "reconstruction_loss",
 ]
 
@@ -81,6 +84,23 @@ def build_objectives(objectives: ObjectiveSettings, encoder: PixelEncoder, actio
         _check_settings(name, cls, own)
         modules[_short_name(name)] = cls.for_encoder(encoder, action_dim, **own)
     return modules
+
+
+def reads_next(objectives: nn.ModuleDict, buffer: ReplayBuffer | None, n_steps: int) -> bool:
+    """
+    :param objectives: what :func:`build_objectives` returned
+    :param buffer: where batches come from
+    :param n_steps: over how many rewards it sums
+    :return: whether one of the objectives reads o_{t+1}
+    :raises ValueError: if it does, and the buffer returns o_{t+n} alone
+    """
+    readers = [name for name, objective in objectives.items() if objective.reads_next]
+    if readers and n_steps > 1 and not isinstance(buffer, FrameReplayBuffer):
+        raise ValueError(
+            f"objective {readers[0]!r} reads the observation one step on, which {type(buffer).__name__} does not return with "
+            f"n_steps={n_steps}: use FrameReplayBuffer or n_steps=1"
+        )
+    return bool(readers)
 
 
 def _short_name(name: str) -> str:

@@ -1,0 +1,262 @@
+"""A FrameReplayBuffer on disk: segments of frames, which are written once, and a small index that names them.
+
+A folder holds ``frames-<number of the first>-<unique>.npy``, each up to ``SEGMENT`` frames, and ``index.npz`` with everything
+else. Saving to the same folder again writes only the frames that are new since, then replaces the index, then deletes the
+segments that it no longer names: at any moment there is a whole buffer in the folder. Nothing is pickled.
+"""
+
+import io
+import json
+import os
+import pickle
+import uuid
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl
+
+from sb3_crc.atomic import atomic_write, sync
+from sb3_crc.buffers.replay import FrameReplayBuffer
+
+#: Version of the layout
+FORMAT = 1
+#: Frames in a full segment
+SEGMENT = 1024
+INDEX = "index.npz"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """
+    A file of consecutive frames, which never changes.
+
+    :param name: of the file
+    :param first: number of its first frame
+    :param end: one more than the number of its last frame
+    """
+
+    name: str
+    first: int
+    end: int
+
+
+def save_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIOBase) -> None:
+    """
+    Save the transitions and the frames that they use.
+
+    :param buffer: what to save
+    :param path: a folder, which is made, added to, or takes the place of a file, with ``.pkl`` at its end if it has no ending
+        (SB3's rule); or a stream, which gets the same as a zip
+    """
+    if isinstance(path, io.BufferedIOBase):
+        with zipfile.ZipFile(path, "w") as archive:
+            _write(buffer, _Archive(archive), ())
+        return
+    target = Path(path)
+    target = target if target.suffix else _with_ending(target)
+    if target.is_file():  # SB3's pickle makes way only for a whole buffer
+        new, old = (target.with_name(f".{target.name}.{os.getpid()}.{word}") for word in ("new", "old"))
+        buffer.segments = _write(buffer, _Folder(new), ())
+        os.replace(target, old)
+        os.replace(new, target)
+        old.unlink()
+    else:
+        folder = _Folder(target)
+        buffer.segments = _write(buffer, folder, buffer.segments)
+        folder.keep({segment.name for segment in buffer.segments})
+
+
+def load_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIOBase) -> None:
+    """
+    Fill a buffer with a saved one, whose size it takes over; ``n_steps`` and ``gamma`` stay its own.
+
+    :param buffer: of the same spaces and number of environments
+    :param path: folder or stream of :func:`save_buffer_file`, or SB3's pickle of a replay buffer
+    :raises FileNotFoundError: if there is none
+    :raises ValueError: if it is damaged, of a later format, or does not fit ``buffer``, which then stays as it was
+    """
+    if isinstance(path, io.BufferedIOBase):
+        is_zip = zipfile.is_zipfile(path)
+        path.seek(0)
+        if is_zip:
+            with zipfile.ZipFile(path) as archive:
+                _read(buffer, _Archive(archive), "the stream")
+        else:
+            _read_pickle(buffer, path)
+        return
+    source = next((file for file in (Path(path), _with_ending(Path(path))) if file.exists()), None)
+    if source is None:
+        raise FileNotFoundError(f"there is no replay buffer {path}")
+    if source.is_dir():
+        _read(buffer, _Folder(source), str(source))
+    elif zipfile.is_zipfile(source):
+        with zipfile.ZipFile(source) as archive:
+            _read(buffer, _Archive(archive), str(source))
+    else:
+        _read_pickle(buffer, source)
+
+
+def _with_ending(path: Path) -> Path:
+    return path.with_name(f"{path.name}.pkl")
+
+
+class _Folder:
+    def __init__(self, path: Path):
+        self.path = path
+
+    def has(self, name: str) -> bool:
+        return (self.path / name).exists()
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[IO[bytes]]:
+        self.path.mkdir(parents=True, exist_ok=True)
+        with atomic_write(self.path / name) as unfinished, unfinished.open("wb") as file:
+            yield file
+
+    @contextmanager
+    def reading(self, name: str) -> Iterator[IO[bytes]]:
+        with (self.path / name).open("rb") as file:
+            yield file
+
+    def keep(self, names: set[str]) -> None:
+        """Delete the segments, whole or not, that are not among the ``names``."""
+        for file in self.path.iterdir():
+            if file.name.lstrip(".").startswith("frames-") and file.name not in names:
+                file.unlink()
+        sync(self.path)
+
+
+class _Archive:
+    def __init__(self, archive: zipfile.ZipFile):
+        self.archive = archive
+
+    def has(self, name: str) -> bool:
+        return name in self.archive.namelist()
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[IO[bytes]]:
+        with self.archive.open(name, "w", force_zip64=True) as file:
+            yield file
+
+    @contextmanager
+    def reading(self, name: str) -> Iterator[IO[bytes]]:
+        with self.archive.open(name) as file:
+            yield file
+
+
+def _write(buffer: FrameReplayBuffer, container: _Folder | _Archive, written: tuple[Segment, ...]) -> tuple[Segment, ...]:
+    store, size = buffer.store, buffer.size()
+    segments = _still_good(container, written, store.first)
+    for start in range(segments[-1].end if segments else store.first, store.end, SEGMENT):
+        end = min(start + SEGMENT, store.end)
+        segment = Segment(f"frames-{start:012d}-{uuid.uuid4().hex[:12]}.npy", start, end)
+        with container.writing(segment.name) as file:
+            np.lib.format.write_array(file, store.read(start, end), allow_pickle=False)
+        segments.append(segment)
+
+    header = {
+        "format": FORMAT,
+        **_description(buffer),
+        "frame_channels": buffer.frame_channels,
+        "buffer_size": buffer.buffer_size,
+        "pos": buffer.pos,
+        "full": buffer.full,
+        "first_frame": store.first,
+        "end_frame": store.end,
+        "latest": [[int(number) for number in latest.numbers] for latest in buffer.latest],
+        "segments": [asdict(segment) for segment in segments],
+    }
+    arrays = {name: values[:size] for name, values in buffer.arrays().items()}
+    with container.writing(INDEX) as file:
+        np.savez(file, **{"header": np.array(json.dumps(header)), **arrays})  # type: ignore[arg-type]
+    return tuple(segments)
+
+
+def _still_good(container: _Folder | _Archive, written: tuple[Segment, ...], first: int) -> list[Segment]:
+    """:return: the written segments that need not be written again"""
+    segments = [segment for segment in written if segment.end > first]
+    starts_early = bool(segments) and segments[0].first <= first
+    if not starts_early or not all(container.has(segment.name) for segment in segments):
+        return []
+    if segments[-1].end - segments[-1].first < SEGMENT:
+        segments.pop()  # written anew with what follows it, or frequent saves would leave ever more small files
+    return segments
+
+
+def _description(buffer: FrameReplayBuffer) -> dict[str, Any]:
+    """What must agree between a file and the buffer that it is loaded into."""
+    channels, *size = buffer.store.shape
+    return {
+        "observations": [buffer.stack_size * channels, *size],
+        "dtype": buffer.store.dtype.str,
+        "vectors": {key: list(shape) for key, shape in buffer.vector_shapes().items()},
+        "action_dim": buffer.action_dim,
+        "n_envs": buffer.n_envs,
+    }
+
+
+def _read(buffer: FrameReplayBuffer, container: _Folder | _Archive, name: str) -> None:
+    if not container.has(INDEX):
+        raise FileNotFoundError(f"there is no replay buffer in {name}: {INDEX} is missing")
+    try:
+        with container.reading(INDEX) as file, np.load(file, allow_pickle=False) as index:
+            arrays = {key: index[key] for key in index.files}
+        header = json.loads(str(arrays.pop("header")))
+        if header["format"] > FORMAT:
+            raise ValueError(f"its format is {header['format']}, this version of sb3_crc reads up to {FORMAT}")
+        for key, own in _description(buffer).items():
+            if header[key] != own:
+                raise ValueError(f"{key} is {header[key]} there and {own} here")
+        loaded = buffer.empty_copy(header["buffer_size"] * header["n_envs"], header["frame_channels"])
+        loaded.store.first = loaded.store.end = header["first_frame"]
+        segments = tuple(Segment(**segment) for segment in header["segments"])
+        for segment in segments:
+            with container.reading(segment.name) as file:
+                frames = np.lib.format.read_array(file, allow_pickle=False)
+            if len(frames) != segment.end - segment.first:
+                raise ValueError(f"{segment.name} has {len(frames)} frames instead of {segment.end - segment.first}")
+            loaded.store.extend(frames[max(0, header["first_frame"] - segment.first) :])
+        if loaded.store.end != header["end_frame"]:
+            raise ValueError(f"there are frames up to {loaded.store.end} instead of {header['end_frame']}")
+        loaded.restore(arrays, header["pos"], full=header["full"], latest=header["latest"])
+    except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"the replay buffer in {name} cannot be loaded: {error}") from error
+    vars(buffer).update(vars(loaded))
+    buffer.segments = segments if isinstance(container, _Folder) else ()
+
+
+def _read_pickle(buffer: FrameReplayBuffer, source: Path | io.BufferedIOBase) -> None:
+    """Store the transitions of SB3's ReplayBuffer one by one, in the rows that they have there."""
+    try:
+        other = load_from_pkl(source)
+    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError) as error:
+        raise ValueError(f"{source} is neither a saved replay buffer nor SB3's pickle of one: {error}") from error
+    if not isinstance(other, ReplayBuffer) or other.optimize_memory_usage:
+        raise ValueError(f"{source} holds a {type(other).__name__}, not a replay buffer with both obs and next_obs")
+    for name in ("observation_space", "action_space", "n_envs"):
+        if getattr(other, name) != getattr(buffer, name):
+            raise ValueError(f"{source}: {name} is {getattr(other, name)} there and {getattr(buffer, name)} here")
+    if isinstance(other, FrameReplayBuffer):
+        loaded = other
+        loaded.n_steps, loaded.gamma, loaded.device = buffer.n_steps, buffer.gamma, buffer.device
+    else:
+        loaded = buffer.empty_copy(other.buffer_size * other.n_envs, buffer.frame_channels)
+        oldest = other.pos if other.full else 0
+        loaded.pos = oldest
+        for row in ((np.arange(other.size()) + oldest) % other.buffer_size).tolist():
+            obs, next_obs = (_row(part, row) for part in (other.observations, other.next_observations))
+            infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in other.timeouts[row]]
+            loaded.add(obs, next_obs, other.actions[row], other.rewards[row], other.dones[row], infos)
+    vars(buffer).update(vars(loaded))
+
+
+def _row(observations: Any, row: int) -> Any:
+    if isinstance(observations, Mapping):
+        return {key: values[row] for key, values in observations.items()}
+    return observations[row]

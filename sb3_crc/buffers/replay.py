@@ -1,0 +1,393 @@
+"""Replay buffers for stacks of frames, in which each frame is stored once.
+
+B batch, k frames in a stack, C channels of a frame, H, W height and width, A action, N ``n_envs``.
+"""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+from typing_extensions import Self
+
+from sb3_crc.buffers.samples import FrameSamples, whole
+from sb3_crc.buffers.store import SLACK, FrameStacks, FrameStore
+from sb3_crc.memory import GIGABYTE, free_memory
+
+#: Share of the free memory that a buffer which "would fit" takes: the rest is the training's
+USABLE = 0.9
+
+
+class Latest(NamedTuple):
+    """The last next_obs of an environment and the numbers of its frames; nothing before the first and after a reset."""
+
+    stack: np.ndarray | None = None
+    numbers: list[int] = []  # noqa: RUF012  # never written to
+
+
+class FrameReplayBuffer(ReplayBuffer):
+    """
+    SB3's ReplayBuffer, and its NStepReplayBuffer, in a sixth of the memory for stacks of three frames: each frame is stored
+    once, and a transition keeps the numbers of its frames. The same transitions are sampled with the same random numbers.
+
+    The frames lie on ``device``. They take memory as they come, not before.
+
+    A transition whose observation is not the one that the previous transition led to starts a new trajectory, whether the
+    previous one was done or the environment was reset early; n-step returns end there and bootstrap.
+
+    :param buffer_size: capacity in transitions
+    :param observation_space: a Box
+    :param action_space: as in SB3
+    :param device: where frames are stored and samples returned
+    :param n_envs: number N of environments
+    :param optimize_memory_usage: must be False: there is nothing left to optimise
+    :param handle_timeout_termination: as in SB3: a time limit is no termination
+    :param frame_channels: channels C of one frame, where an observation is a stack of k frames along its first axis, newest
+        last; None: observations are stored whole (and once, not as both obs and next_obs)
+    :param n_steps: rewards that are summed before the return is bootstrapped
+    :param gamma: discount in that sum
+    :raises ValueError: for arguments that cannot work, naming the value and what is allowed
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        frame_channels: int | None = None,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+    ):
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs)
+        if optimize_memory_usage:
+            raise ValueError(f"optimize_memory_usage=True is not supported by {type(self).__name__}: frames are stored once")
+        if n_steps < 1:
+            raise ValueError(f"n_steps={n_steps} must be at least 1")
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.n_steps = n_steps
+        self.gamma = gamma
+
+        space = self._stacked_space()
+        assert space.shape is not None
+        self.frame_channels = frame_channels
+        self.stack_size, frame_shape = _frames_of(space.shape, frame_channels)
+        transitions = self.buffer_size * n_envs
+        capacity = transitions + round(SLACK * transitions) + n_envs * (self.stack_size + 1)
+        self.store = FrameStore(frame_shape, space.dtype, capacity, self.device)
+
+        rows = self.buffer_size, n_envs
+        #: Numbers of the frames of each transition: o_t is all but the last, o_{t+1} all but the first
+        self.frame_numbers = np.zeros((*rows, self.stack_size + 1), np.int64)
+        self.actions = np.zeros((*rows, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
+        self.rewards = np.zeros(rows, np.float32)
+        self.dones = np.zeros(rows, np.float32)
+        self.timeouts = np.zeros(rows, np.float32)
+        #: Where a trajectory ends that is not done: the next transition of this environment starts elsewhere
+        self.interrupted = np.zeros(rows, np.bool_)
+        #: The last next_obs of each environment
+        self.latest = [Latest()] * n_envs
+        #: Files of :mod:`~sb3_crc.buffers.files` that hold frames of this buffer
+        self.segments: tuple[Any, ...] = ()
+        self._warned = False
+
+    # -- Memory --------------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> th.device:
+        """Where the frames lie and samples are returned; SB3's ``load_replay_buffer`` writes it."""
+        return self._device
+
+    @device.setter
+    def device(self, device: th.device | str) -> None:
+        self._device = th.device(device)
+        if hasattr(self, "store"):
+            self.store.to(self._device)
+
+    @property
+    def full_bytes(self) -> int:
+        """What the frames of a full buffer need, with the slack that is kept for the first frames of episodes."""
+        return self.store.capacity * self.store.frame_bytes
+
+    def warn_if_too_large(self) -> None:
+        """Warn, once, if the full buffer will not fit in free memory, with the size that would."""
+        if self._warned:
+            return
+        self._warned = True
+        taken = len(self.store) * self.store.frame_bytes if self.store.allocated else 0
+        available = free_memory(self.device) + taken
+        if self.full_bytes > available:
+            fits = int(USABLE * available / self.full_bytes * self.buffer_size * self.n_envs)
+            warnings.warn(
+                f"the replay buffer needs {self.full_bytes / GIGABYTE:.2f} GB when its {self.buffer_size * self.n_envs} "
+                f"transitions are full, but only {available / GIGABYTE:.2f} GB are free on {self.device}: "
+                f"training may be killed then; buffer_size={fits} would fit",
+                stacklevel=2,
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_warned": False}
+
+    # -- Saving --------------------------------------------------------------------------------------------------------
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """:return: everything but the frames, by name, each of shape ``(buffer_size, N, ...)``"""
+        names = ("frame_numbers", "actions", "rewards", "dones", "timeouts", "interrupted")
+        return {name: getattr(self, name) for name in names}
+
+    def vector_shapes(self) -> dict[str, tuple[int, ...]]:
+        """:return: shapes of what is stored beside the image, by key"""
+        return {}
+
+    def empty_copy(self, buffer_size: int, frame_channels: int | None) -> Self:
+        """
+        :param buffer_size: capacity in transitions
+        :param frame_channels: channels of a frame
+        :return: an empty buffer with otherwise the same settings
+        """
+        return type(self)(
+            buffer_size,
+            self.observation_space,
+            self.action_space,
+            self.device,
+            self.n_envs,
+            handle_timeout_termination=self.handle_timeout_termination,
+            frame_channels=frame_channels,
+            n_steps=self.n_steps,
+            gamma=self.gamma,
+        )
+
+    def restore(self, arrays: Mapping[str, np.ndarray], pos: int, *, full: bool, latest: list[list[int]]) -> None:
+        """
+        Fill an empty buffer whose store has its frames already.
+
+        :param arrays: what :meth:`arrays` returned, its first ``size`` rows
+        :param pos: row that is written next
+        :param full: whether all rows have been written
+        :param latest: numbers of the frames of each environment's last next_obs
+        :raises ValueError: if an array is missing or does not fit
+        """
+        self.pos, self.full = pos, full
+        for name, values in self.arrays().items():
+            values[: self.size()] = arrays[name]
+        self.latest = [Latest(self._stack(numbers), numbers) if numbers else Latest() for numbers in latest]
+
+    def _stack(self, numbers: list[int]) -> np.ndarray:
+        return np.concatenate([self.store.read(number, number + 1) for number in numbers])
+
+    # -- Writing -------------------------------------------------------------------------------------------------------
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition of each environment.
+
+        :param obs: ``(N, k C, H, W)``
+        :param next_obs: the same; where ``done``, the last observation of the episode
+        :param action: ``(N, A)``
+        :param reward: ``(N,)``
+        :param done: ``(N,)``
+        :param infos: N dicts; ``TimeLimit.truncated`` is read
+        :raises ValueError: if ``next_obs`` is not ``obs`` shifted by one frame; the buffer stays as it was
+        """
+        stacks, next_stacks = self._stacks(obs), self._stacks(next_obs)  # (N, k, C, H, W)
+        actions = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        self._check_overlap(stacks, next_stacks)
+        self.warn_if_too_large()
+        continues = [self._continues(env, obs, stacks[env]) for env in range(self.n_envs)]
+        self._drop_unused()
+        row = self.pos
+        for env in range(self.n_envs):
+            if continues[env]:
+                numbers = self.latest[env].numbers
+            else:
+                self._interrupt(env)
+                numbers = self._append_stack(stacks[env])
+            numbers = [*numbers, self.store.append(next_stacks[env, -1])]
+            self.frame_numbers[row, env] = numbers
+            self.latest[env] = Latest(next_stacks[env].copy(), numbers[1:])
+        self._add_vectors(obs, next_obs)
+        self.actions[row], self.rewards[row], self.dones[row] = actions, reward, done
+        self.interrupted[row] = False
+        if self.handle_timeout_termination:
+            self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def interrupt(self) -> None:
+        """Say that the environments were reset: what is added next does not continue what was added last."""
+        for env in range(self.n_envs):
+            self._interrupt(env)
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        self.store.clear()
+        self.interrupted[:] = False
+        self.latest = [Latest()] * self.n_envs
+        self.segments = ()
+
+    def _stacks(self, obs: Any) -> np.ndarray:
+        """:return: the images as frames, ``(N, k, C, H, W)``"""
+        images = np.asarray(self._images(obs))
+        shape = self.n_envs, *self._stacked_space().shape
+        if images.shape != shape:
+            raise ValueError(f"observations of shape {images.shape} do not fit the buffer, which stores {shape}")
+        return images.astype(self.store.dtype, copy=False).reshape(self.n_envs, self.stack_size, *self.store.shape)
+
+    def _check_overlap(self, stacks: np.ndarray, next_stacks: np.ndarray) -> None:
+        if np.array_equal(stacks[:, 1:], next_stacks[:, :-1]):
+            return
+        env = next(e for e in range(self.n_envs) if not np.array_equal(stacks[e, 1:], next_stacks[e, :-1]))
+        raise ValueError(
+            f"transition {self.pos} of environment {env}: next_obs is not obs shifted by one frame of frame_channels="
+            f"{self.frame_channels} channels. If observations are not stacks of frames, or something changes them after "
+            "they are stacked, store them whole: replay_buffer_kwargs={'frame_channels': None}"
+        )
+
+    def _continues(self, env: int, obs: Any, stack: np.ndarray) -> bool:
+        latest = self.latest[env].stack
+        return latest is not None and np.array_equal(latest, stack)
+
+    def _interrupt(self, env: int) -> None:
+        if self.latest[env].stack is not None:
+            self.interrupted[self.pos - 1, env] = not self.dones[self.pos - 1, env]
+        self.latest[env] = Latest()
+
+    def _drop_unused(self) -> None:
+        """Before the row at ``pos`` is overwritten: drop the frames that it alone used."""
+        if not self.full:
+            return
+        used = [number for latest in self.latest for number in latest.numbers[:1]]
+        if self.buffer_size > 1:
+            used.append(int(self.frame_numbers[(self.pos + 1) % self.buffer_size].min()))
+        self.store.drop_before(min(used, default=self.store.end))
+
+    def _append_stack(self, stack: np.ndarray) -> list[int]:
+        """Store the frames of an episode's first observation, in which the first picture may stand k times."""
+        numbers: list[int] = []
+        for index, frame in enumerate(stack):
+            same = index > 0 and np.array_equal(frame, stack[index - 1])
+            numbers.append(numbers[-1] if same else self.store.append(frame))
+        return numbers
+
+    # -- Reading -------------------------------------------------------------------------------------------------------
+
+    def sample_frames(self, batch_size: int, env: VecNormalize | None = None) -> FrameSamples:
+        """
+        As ``sample``, but the observations stay in the store: read them before anything is added.
+
+        :param batch_size: B
+        :param env: normalises rewards
+        """
+        rows = np.random.randint(0, self.size(), size=batch_size)
+        return self._frame_samples(rows, env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
+        return self._frame_samples(batch_inds, env).whole()
+
+    def _frame_samples(self, rows: np.ndarray, env: VecNormalize | None) -> FrameSamples:
+        envs = np.random.randint(0, self.n_envs, size=rows.shape)  # as in SB3, also for a single one
+        last, rewards, discounts = rows, self.rewards[rows, envs][:, None], None
+        if self.n_steps > 1:
+            last, rewards, discounts = self._n_step_returns(rows, envs, env)
+        else:
+            rewards = self._normalize_reward(rewards, env)
+        one_step = self._observations(rows, envs, env, following=True)
+        return FrameSamples(
+            self._observations(rows, envs, env, following=False),
+            self.to_torch(self.actions[rows, envs]),
+            one_step if self.n_steps == 1 else self._observations(last, envs, env, following=True),
+            self.to_torch((self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None]),
+            self.to_torch(rewards),
+            None if discounts is None else self.to_torch(discounts),
+            one_step,
+        )
+
+    def _n_step_returns(
+        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """:return: row of the last step ``(B,)``, sum of rewards ``(B, 1)``, discount of the value after it ``(B, 1)``"""
+        steps = np.arange(self.n_steps)
+        at = (rows[:, None] + steps) % self.buffer_size, envs[:, None]  # (B, n)
+        ends = (self.dones[at] > 0) | (self.timeouts[at] > 0) | self.interrupted[at]
+        ends |= at[0] == (self.pos - 1) % self.buffer_size  # what follows there is the oldest transition
+        ends[:, -1] = True
+        n = ends.argmax(axis=1)  # steps after the first
+        mask = steps <= n[:, None]
+        rewards = self._normalize_reward(self.rewards[at], env)
+        gammas = self.gamma ** steps.astype(np.float32)
+        returns = (rewards * gammas * mask).sum(axis=1, keepdims=True)
+        discounts = self.gamma ** mask.sum(axis=1, keepdims=True).astype(np.float32)
+        return at[0][np.arange(len(rows)), n], returns, discounts
+
+    @property
+    def observations(self) -> Any:  # type: ignore[override]
+        """o_t of all stored transitions, gathered: ``(size, N, k C, H, W)``, as much memory as SB3 needs for them."""
+        return self._all_observations(following=False)
+
+    @property
+    def next_observations(self) -> Any:  # type: ignore[override]
+        """o_{t+1} of all stored transitions, like ``observations``."""
+        return self._all_observations(following=True)
+
+    def _all_observations(self, *, following: bool) -> Any:
+        rows, envs = (index.flatten() for index in np.indices((self.size(), self.n_envs)))
+        shape = self.size(), self.n_envs
+        everything = whole(self._observations(rows, envs, None, following=following))
+        if isinstance(everything, Mapping):
+            return {key: values.cpu().numpy().reshape(*shape, *values.shape[1:]) for key, values in everything.items()}
+        return everything.cpu().numpy().reshape(*shape, *everything.shape[1:])
+
+    def _frame_stacks(self, rows: np.ndarray, envs: np.ndarray, following: bool) -> FrameStacks:
+        numbers = self.frame_numbers[rows, envs]
+        return FrameStacks(self.store, numbers[:, 1:] if following else numbers[:, :-1])
+
+    # -- What DictFrameReplayBuffer does otherwise ---------------------------------------------------------------------
+
+    def _stacked_space(self) -> spaces.Box:
+        if not isinstance(self.observation_space, spaces.Box):
+            hint = "; for Dict observations there is DictFrameReplayBuffer" * isinstance(self.observation_space, spaces.Dict)
+            raise ValueError(f"{type(self).__name__} stores Box observations, got {self.observation_space}{hint}")
+        return self.observation_space
+
+    def _images(self, obs: Any) -> Any:
+        return obs
+
+    def _add_vectors(self, obs: Any, next_obs: Any) -> None:
+        pass
+
+    def _observations(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, *, following: bool) -> Any:
+        return self._frame_stacks(rows, envs, following)
+
+
+def _frames_of(shape: tuple[int, ...], frame_channels: int | None) -> tuple[int, tuple[int, ...]]:
+    """:return: k and the shape of a frame"""
+    if frame_channels is None:
+        return 1, shape
+    if frame_channels < 1 or shape[0] % frame_channels != 0:
+        divisors = [str(c) for c in range(1, shape[0] + 1) if shape[0] % c == 0]
+        raise ValueError(
+            f"frame_channels={frame_channels} must divide the {shape[0]} channels of observations {shape}: "
+            f"{', '.join(divisors)}, or None to store them whole"
+        )
+    return shape[0] // frame_channels, (frame_channels, *shape[1:])
