@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_crc.augmentations import ImageSize, center_crop
 from sb3_crc.image_spaces import image_shape, image_space, split_observations
@@ -70,7 +71,8 @@ class PixelEncoder(BaseFeaturesExtractor):
 
         layers: list[nn.Module] = []
         for c_in, c_out, stride in zip((frame_stack, *channels), channels, strides, strict=False):
-            layers += [nn.Conv2d(c_in, c_out, kernel_size, stride), nn.ReLU()]
+            convolution = CenteredConv2d if center_input and not layers else nn.Conv2d
+            layers += [convolution(c_in, c_out, kernel_size, stride), nn.ReLU()]
         self.convolutions = nn.Sequential(*layers)
         minimum = smallest_input(self.strides, kernel_size)
         if min(height, width) < minimum:
@@ -99,8 +101,6 @@ class PixelEncoder(BaseFeaturesExtractor):
         images, _ = split_observations(observations, self.observation_space)
         images = center_crop(images, self.input_shape[1:])
         pixels = scale_pixels(images) if images.dtype == th.uint8 else images.contiguous(memory_format=th.channels_last)
-        if self.center_input:
-            pixels = pixels - 0.5
         features: th.Tensor = self.convolutions(pixels).flatten(start_dim=1)
         return features
 
@@ -108,6 +108,16 @@ class PixelEncoder(BaseFeaturesExtractor):
         """:param features: convolution output ``(B, F)``; :return: latents ``(B, Z)``"""
         latents: th.Tensor = self.projection(features)
         return latents
+
+
+class CenteredConv2d(nn.Conv2d):
+    """A convolution of its input minus 1/2, without padding, so that the bias can take the shift: no pass over the pixels."""
+
+    def forward(self, input: th.Tensor) -> th.Tensor:
+        """:param input: ``(B, C, H, W)``; :return: as Conv2d"""
+        assert self.bias is not None
+        bias = self.bias - 0.5 * self.weight.sum(dim=(1, 2, 3))
+        return F.conv2d(input, self.weight, bias, self.stride)
 
 
 def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.Sequential:
@@ -122,7 +132,8 @@ def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.
 
 def scale_pixels(images: th.Tensor) -> th.Tensor:
     """The one place where bytes become floats. :return: float32 in [0, 1], channels last in memory"""
-    return images.to(th.float32, memory_format=th.channels_last).div_(255.0)
+    # Bytes are cheaper to rearrange than floats
+    return images.contiguous(memory_format=th.channels_last).to(th.float32).div_(255.0)
 
 
 def smallest_input(strides: Sequence[int], kernel_size: int) -> int:

@@ -90,7 +90,7 @@ def test_each_loss_alone_overfits_one_batch(name: str, share: float) -> None:
     batch = model.replay_buffer.sample(64)
     images = pictures(64)
     batch = ReplayBufferSamples(images, batch.actions, images, batch.dones, batch.rewards)
-    model.replay_buffer.sample = lambda batch_size, env=None: batch
+    model.replay_buffer.sample_frames = lambda batch_size, env=None: batch
     losses = []
     for _ in range(500):
         model.train(gradient_steps=1, batch_size=64)

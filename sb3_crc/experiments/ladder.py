@@ -1,0 +1,172 @@
+"""The ladder under learning from pixels: what must work before the next rung is worth a try.
+
+State SAC shows that the environment can be learned at all, the probe what a latent knows before it has learned anything, and
+overfitting that each loss can be minimised. The rungs above are runs of ``train.py``.
+
+N frames, B batch, Z latent, S state.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_crc.buffers import FrameReplayBuffer
+from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.encoder import PixelEncoder
+from sb3_crc.envs.dmc import make_dmc
+
+#: SB3's SAC from states, with the replay ratio of the laptop class
+STATE_SAC = {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 2, "tau": 0.01}
+#: Ridge penalty of the probe, on standardised latents
+RIDGE = 1e-3
+
+
+def state_sac(
+    task: str, *, agent_steps: int = 12_500, evaluations: int = 5, episodes: int = 10, seed: int = 0
+) -> dict[str, Any]:
+    """
+    Train stock SAC on the task's states, at the repeat that its pixels have.
+
+    :param task: as for :func:`~sb3_crc.make_dmc`
+    :param agent_steps: decisions to train for
+    :param evaluations: how often it is evaluated, at equal distances
+    :param episodes: fresh ones of each evaluation, with the policy's mean
+    :param seed: of everything; evaluations use seed + 1000
+    :return: curve as environment steps, means and standard deviations
+    """
+    env = make_dmc(task, observation="state", seed=seed)
+    fresh = Monitor(make_dmc(task, observation="state", seed=seed + 1000))
+    model = SAC("MlpPolicy", env, seed=seed, device="cpu", **STATE_SAC)  # type: ignore[arg-type]
+    curve = []
+    for evaluation in range(evaluations):
+        model.learn(agent_steps // evaluations, reset_num_timesteps=evaluation == 0)
+        returns, _ = evaluate_policy(model, fresh, n_eval_episodes=episodes, return_episode_rewards=True)
+        curve.append(
+            {
+                "environment_steps": model.num_timesteps * env.action_repeat,
+                "mean": float(np.mean(returns)),
+                "std": float(np.std(returns, ddof=1)),
+                "min": float(np.min(returns)),
+            }
+        )
+    return {"task": task, "seed": seed, "settings": STATE_SAC, "episodes": episodes, "curve": curve}
+
+
+def probe_random_encoder(
+    task: str, encoder_kwargs: Mapping[str, Any], *, frames: int = 4_000, image_size: int = 64, seed: int = 0
+) -> dict[str, Any]:
+    """
+    How much of the state can be read off the latent of an untrained encoder, and off its convolutions, by ridge regression.
+
+    :param task: as for :func:`~sb3_crc.make_dmc`
+    :param encoder_kwargs: arguments of :class:`~sb3_crc.PixelEncoder`
+    :param frames: stacks that are collected with random actions; the last fifth, later episodes, is held out
+    :param image_size: side of the frames in pixels, drawn in the fast quality
+    :param seed: of environment, actions and weights
+    :return: R^2 on held-out frames, by what is looked at and by the name of the task's observation (mean over its coordinates)
+    """
+    images, states = _random_frames(task, frames, image_size, seed)
+    th.manual_seed(seed)
+    space = make_dmc(task, image_size=image_size, render_quality="fast", seed=seed).observation_space
+    encoder = PixelEncoder(space, **encoder_kwargs)
+    with th.no_grad():
+        convolved = th.cat([encoder.convolve(th.from_numpy(part)) for part in np.array_split(images, max(1, frames // 256))])
+        latents = encoder.project(convolved)
+    looks = {"latent": latents.numpy(), "convolutions": convolved.numpy()}
+    scores = {look: {name: linear_probe(inputs, values) for name, values in states.items()} for look, inputs in looks.items()}
+    return {"task": task, "seed": seed, "frames": frames, "encoder": dict(encoder_kwargs), "r2": scores}
+
+
+def linear_probe(inputs: np.ndarray, targets: np.ndarray, *, held_out: float = 0.2) -> float:
+    """
+    :param inputs: ``(N, Z)``
+    :param targets: ``(N, S)``
+    :param held_out: share of the rows, from the end, on which it is scored
+    :return: R^2 of ridge regression, the mean over the targets' coordinates that vary
+    """
+    split = round(len(inputs) * (1 - held_out))
+    mean, std = inputs[:split].mean(axis=0), inputs[:split].std(axis=0)
+    scaled = (inputs - mean) / np.maximum(std, 0.01 * std.max())  # what hardly ever varies must not explode when it does
+    x = np.concatenate([scaled, np.ones((len(inputs), 1))], axis=1).astype(np.float64)
+    train, test = x[:split], x[split:]
+    gram = train.T @ train + RIDGE * split * np.eye(x.shape[1])
+    predicted = test @ np.linalg.solve(gram, train.T @ targets[:split])
+    variances = targets[split:].var(axis=0)
+    errors = ((predicted - targets[split:]) ** 2).mean(axis=0)
+    varies = variances > 1e-8
+    return float(1 - (errors[varies] / variances[varies]).mean())
+
+
+def overfit_one_batch(
+    task: str,
+    objective: str,
+    policy_kwargs: Mapping[str, Any],
+    *,
+    updates: int = 1_000,
+    batch_size: int = 128,
+    learning_rate: float = 1e-3,
+    image_size: int = 64,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """
+    Train encoder and objective on one batch of real frames, which are not augmented; the critic stands still.
+
+    :param task: as for :func:`~sb3_crc.make_dmc`
+    :param objective: its name
+    :param policy_kwargs: of :class:`~sb3_crc.CRCSAC`
+    :param updates: how many
+    :param batch_size: transitions in the batch
+    :param learning_rate: of encoder and objective
+    :param image_size: side of the frames in pixels, drawn in the fast quality
+    :param seed: of everything
+    :return: the loss at the first and at the last update; "pixel_variance" is what a decoder of one mean picture would leave
+    """
+    env = make_dmc(task, image_size=image_size, render_quality="fast", seed=seed)
+    settings = {"qf_learning_rate": 0.0, "encoder_learning_rate": learning_rate, "learning_starts": 4 * batch_size}
+    model = CRCSAC(
+        "CnnPolicy",
+        env,
+        objectives={objective: 1.0},
+        augmentation="center_crop",
+        image_size=image_size,
+        batch_size=batch_size,
+        buffer_size=4 * batch_size,
+        policy_kwargs=dict(policy_kwargs),
+        seed=seed,
+        **settings,  # type: ignore[arg-type]
+    )
+    model.learn(4 * batch_size)
+    assert isinstance(model.replay_buffer, FrameReplayBuffer)
+    batch = model.replay_buffer.sample(batch_size)
+    model.replay_buffer.sample_frames = lambda *_, **__: batch  # type: ignore[method-assign, assignment]
+    losses = []
+    for _ in range(updates):
+        model.train(gradient_steps=1, batch_size=batch_size)
+        losses.append(float(model.logger.name_to_value[f"representation/{objective}"]))
+    pixels = batch.observations.float() / 255
+    return {
+        "objective": objective,
+        "updates": updates,
+        "first": losses[0],
+        "last": losses[-1],
+        "pixel_variance": float((pixels - pixels.mean(dim=0)).square().mean()),
+    }
+
+
+def _random_frames(task: str, frames: int, image_size: int, seed: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    env = make_dmc(task, image_size=image_size, render_quality="fast", observation="dict", seed=seed)
+    observations = []
+    observation, _ = env.reset()
+    for _ in range(frames):
+        observations.append(observation)
+        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            observation, _ = env.reset()
+    env.close()
+    states = {key: np.stack([o[key] for o in observations]) for key in observations[0] if key != "pixels"}
+    return np.stack([o["pixels"] for o in observations]), states
