@@ -88,6 +88,35 @@ def baselines(
 
 
 @app.command()
+def ladder(
+    rung: Annotated[str, typer.Argument(help="state: SAC from states; probe: an untrained encoder; overfit: each loss alone")],
+    task: Annotated[str, typer.Argument(help="domain-task")] = "cartpole-swingup",
+    output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
+    config: Annotated[Path, typer.Option(help="rl-zoo file whose policy_kwargs are used")] = Path("zoo_configs/laptop.yml"),
+    seed: int = 0,
+) -> None:
+    """Measure what must work before learning from pixels can."""
+    import yaml
+
+    from sb3_crc.experiments.ladder import overfit_one_batch, probe_random_encoder, state_sac
+    from sb3_crc.objectives import OBJECTIVES
+
+    policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
+    if rung == "state":
+        measured: object = state_sac(task, seed=seed)
+    elif rung == "probe":
+        measured = probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+    elif rung == "overfit":
+        measured = [overfit_one_batch(task, name, policy_kwargs, seed=seed) for name in OBJECTIVES]
+    else:
+        raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, overfit")
+    if output is None:
+        console.print_json(data=measured)
+    else:
+        output.write_text(json.dumps(measured, indent=2) + "\n")
+
+
+@app.command()
 def curve(
     run: Annotated[Path, typer.Argument(help="folder of a run, with its evaluations.npz")],
     output: Annotated[Path, typer.Option(help="picture to write")] = Path("learning_curve.png"),

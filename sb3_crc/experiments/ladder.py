@@ -22,8 +22,8 @@ from sb3_crc.envs.dmc import make_dmc
 
 #: SB3's SAC from states, with the replay ratio of the laptop class
 STATE_SAC = {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 2, "tau": 0.01}
-#: Ridge penalty of the probe, on standardised latents
-RIDGE = 1e-3
+#: Ridge penalties that the probe tries, on standardised inputs
+PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
 def state_sac(
@@ -86,20 +86,25 @@ def linear_probe(inputs: np.ndarray, targets: np.ndarray, *, held_out: float = 0
     """
     :param inputs: ``(N, Z)``
     :param targets: ``(N, S)``
-    :param held_out: share of the rows, from the end, on which it is scored
+    :param held_out: share of the rows, from the end, on which it is scored; as many before them choose the penalty
     :return: R^2 of ridge regression, the mean over the targets' coordinates that vary
     """
-    split = round(len(inputs) * (1 - held_out))
-    mean, std = inputs[:split].mean(axis=0), inputs[:split].std(axis=0)
+    rows = round(len(inputs) * held_out)
+    mean, std = inputs[:-rows].mean(axis=0), inputs[:-rows].std(axis=0)
     scaled = (inputs - mean) / np.maximum(std, 0.01 * std.max())  # what hardly ever varies must not explode when it does
     x = np.concatenate([scaled, np.ones((len(inputs), 1))], axis=1).astype(np.float64)
-    train, test = x[:split], x[split:]
-    gram = train.T @ train + RIDGE * split * np.eye(x.shape[1])
-    predicted = test @ np.linalg.solve(gram, train.T @ targets[:split])
-    variances = targets[split:].var(axis=0)
-    errors = ((predicted - targets[split:]) ** 2).mean(axis=0)
-    varies = variances > 1e-8
-    return float(1 - (errors[varies] / variances[varies]).mean())
+    targets = targets[:, targets[:-rows].var(axis=0) > 1e-8].astype(np.float64)
+    penalty = max(PENALTIES, key=lambda penalty: _ridge_r2(x[:-rows], targets[:-rows], rows, penalty))
+    return _ridge_r2(x, targets, rows, penalty)
+
+
+def _ridge_r2(x: np.ndarray, targets: np.ndarray, rows: int, penalty: float) -> float:
+    """Fit on all but the last ``rows``, score on those."""
+    train = x[:-rows]
+    gram = train.T @ train + penalty * len(train) * np.eye(x.shape[1])
+    predicted = x[-rows:] @ np.linalg.solve(gram, train.T @ targets[:-rows])
+    errors = ((predicted - targets[-rows:]) ** 2).mean(axis=0)
+    return float(1 - (errors / targets[-rows:].var(axis=0).clip(1e-8)).mean())
 
 
 def overfit_one_batch(

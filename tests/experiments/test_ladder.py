@@ -1,0 +1,56 @@
+"""The measurements under learning from pixels, on budgets of seconds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sb3_crc.cli import app
+from sb3_crc.experiments.ladder import linear_probe, overfit_one_batch, probe_random_encoder, state_sac
+
+SMALL = {"channels": [8, 8], "strides": [2, 2], "features_dim": 16}
+
+
+def test_a_probe_reads_what_is_linear_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(500, 10))
+    inputs[:, 3] = 1e-9 * rng.normal(size=500)  # dead
+    assert linear_probe(inputs, inputs[:, :2] @ np.array([[1.0, 2.0], [3.0, 4.0]])) > 0.999
+    assert linear_probe(inputs, rng.normal(size=(500, 2))) < 0.1
+    constant = np.column_stack([inputs[:, 0], np.ones(500)])
+    assert linear_probe(inputs, constant) > 0.999  # a coordinate that does not vary cannot be explained
+
+
+def test_an_untrained_encoder_is_probed() -> None:
+    measured = probe_random_encoder("cartpole-swingup", SMALL, frames=1_500, image_size=36)
+    assert set(measured["r2"]["latent"]) == set(measured["r2"]["convolutions"]) == {"position", "velocity"}
+    assert measured["r2"]["convolutions"]["position"] > measured["r2"]["latent"]["position"]
+
+
+def test_state_sac_reports_its_curve() -> None:
+    measured = state_sac("cartpole-swingup", agent_steps=520, evaluations=2, episodes=2)
+    assert [point["environment_steps"] for point in measured["curve"]] == [2080, 4160]
+    assert all(0 <= point["min"] <= point["mean"] <= 1000 for point in measured["curve"])
+
+
+def test_a_loss_is_overfitted_with_the_critic_standing_still() -> None:
+    kwargs = {"net_arch": [16], "features_extractor_kwargs": SMALL}
+    measured = overfit_one_batch("cartpole-swingup", "contrastive", kwargs, updates=30, batch_size=16, image_size=36)
+    assert measured["last"] < measured["first"] < 1.1 * np.log(16)
+    assert 0 < measured["pixel_variance"] < 0.1
+
+
+def test_the_command_writes_json_and_names_the_rungs(tmp_path: Path) -> None:
+    runner = CliRunner()
+    config = tmp_path / "small.yml"
+    config.write_text(f"default: {{policy_kwargs: {{features_extractor_kwargs: {json.dumps(SMALL)}}}}}")
+    result = runner.invoke(app, ["ladder", "stairs", "--config", str(config)])
+    assert result.exit_code == 2 and "state, probe, overfit" in result.output
+
+
+@pytest.mark.slow
+def test_state_sac_solves_the_task() -> None:
+    """The environment can be learned: stock SAC from its states gets what the pixels could give."""
+    assert state_sac("cartpole-swingup", agent_steps=5_000, evaluations=1)["curve"][-1]["mean"] >= 800
