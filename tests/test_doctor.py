@@ -10,12 +10,12 @@ from gymnasium.spaces import Box
 from typer.testing import CliRunner
 
 from sb3_crc import doctor
-from sb3_crc.cli import app
 from sb3_crc.buffers import FrameReplayBuffer
+from sb3_crc.cli import app
 from sb3_crc.doctor import FULL_BUFFER, examine, examine_memory
-from sb3_crc.memory import available_memory
 from sb3_crc.envs import rendering
 from sb3_crc.envs.rendering import RenderingUnavailable
+from sb3_crc.memory import available_memory
 
 
 def test_every_topic_is_looked_at() -> None:

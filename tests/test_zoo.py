@@ -5,16 +5,19 @@ import signal
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rl_zoo3
 import yaml
+from stable_baselines3.common.monitor import Monitor
 
-from sb3_crc import CRCSAC, PRESETS
-from sb3_crc.zoo import CONFIGS, CRCExperimentManager, preset_class, register
-from tests.conftest import POLICY_KWARGS, NoiseEnv
+from sb3_crc import CRCSAC, PRESETS, QBiasEvalCallback
+from sb3_crc.zoo import CRCExperimentManager, preset_class, register
+from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 ROOT = Path(__file__).parent.parent
 ENV = "dmc_pixels/cartpole-swingup-v0"
@@ -103,35 +106,114 @@ def test_arguments_win_over_the_preset() -> None:
 def test_yaml_env_kwargs_reach_the_evaluation_environment(tmp_path: Path) -> None:
     """rl_zoo3 2.9.2 passes them to the training environment only."""
     register()
-    from argparse import Namespace
-
     config = str(ROOT / "tests" / "tiny.yml")
-    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), eval_freq=10, config=config, verbose=0)
+    env = "dmc_pixels/cartpole-balance-v0"
+    manager = CRCExperimentManager(Namespace(), "crc", env, str(tmp_path), eval_freq=10, config=config, verbose=0)
     model, _ = manager.setup_experiment()
     try:
         evaluation = manager.create_envs(1, eval_env=True)
         assert evaluation.observation_space == model.observation_space
         assert evaluation.observation_space.shape == (6, 36, 36)
+        assert evaluation.get_attr("action_repeat") == model.env.get_attr("action_repeat") == [40]
         evaluation.close()
     finally:
         model.env.close()
 
 
-def test_every_configuration_names_only_arguments_that_exist() -> None:
-    """Unknown keys would fail only when somebody trains with them."""
-    import inspect
-
-    from stable_baselines3 import SAC
-
-    known = set(inspect.signature(CRCSAC.__init__).parameters) | set(inspect.signature(SAC.__init__).parameters)
-    zoo_keys = {"n_timesteps", "env_kwargs", "n_envs"}
-    for path in CONFIGS.glob("*.yml"):
-        for env_id, settings in yaml.safe_load(path.read_text()).items():
-            assert set(settings) <= known | zoo_keys, (path, env_id)
+def test_a_callback_that_cannot_work_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    config = {"n_timesteps": 10, "policy": "CnnPolicy", "callback": [{"rl_zoo3.callbacks.ParallelTrainCallback": {}}]}
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({ENV: config}))
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), config=str(tmp_path / "config.yml"), verbose=0)
+    with pytest.raises(ValueError, match="ParallelTrainCallback.*'crc'.*remove"):
+        manager.setup_experiment()
 
 
-def test_crc_yml_is_the_preset() -> None:
-    settings = yaml.safe_load((CONFIGS / "crc.yml").read_text())[ENV]
-    for name, value in PRESETS["crc"].items():
-        assert settings[name] == value, name
-    assert settings["n_timesteps"] * settings["env_kwargs"]["action_repeat"] == 100_000
+def test_without_a_loadable_best_model_the_final_one_is_filmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0)
+    folder = Path(manager.save_path)
+    folder.mkdir(parents=True)
+    (folder / "best_model.zip").write_bytes(b"half of a zip")
+    filmed = []
+
+    def film(policy: object, environment: object, path: Path) -> None:
+        filmed.append(policy)
+        path.write_bytes(b"film")
+
+    monkeypatch.setattr("sb3_crc.zoo.manager.film", film)
+    model = make_model()
+    manager._film(model, model.env)
+    assert filmed == [model]
+    assert (folder / "policy.mp4").read_bytes() == b"film"
+    assert "best_model.zip cannot be loaded" in caplog.text and "final model" in caplog.text
+    assert sorted(path.name for path in folder.iterdir()) == ["best_model.zip", "policy.mp4"]
+
+
+def test_an_interrupted_film_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0)
+    folder = Path(manager.save_path)
+    folder.mkdir(parents=True)
+    (folder / "policy.mp4").write_bytes(b"film")
+
+    def film(policy: object, environment: object, path: Path) -> None:
+        path.write_bytes(b"half of a film")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_crc.zoo.manager.film", film)
+    model = make_model()
+    with pytest.raises(KeyboardInterrupt):
+        manager._film(model, model.env)
+    assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [("policy.mp4", b"film")]
+
+
+class InterruptedEnv(NoiseEnv):
+    """Ctrl-C after so many steps."""
+
+    left = 10**9
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        InterruptedEnv.left -= 1
+        if InterruptedEnv.left < 0:
+            raise KeyboardInterrupt
+        return super().step(action)
+
+
+@pytest.mark.parametrize("moment", ["within an episode", "while writing", "while saving the best model"])
+def test_ctrl_c_in_an_evaluation_leaves_what_was_evaluated(
+    moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = make_model()
+    callback = QBiasEvalCallback(
+        Monitor(InterruptedEnv(length=5)), log_path=str(tmp_path), best_model_save_path=str(tmp_path), eval_freq=10, verbose=0
+    )
+    monkeypatch.setattr(InterruptedEnv, "left", 10**9)
+    model.learn(10, callback=callback)
+
+    def interrupt(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    callback.best_mean_reward = -np.inf
+    if moment == "within an episode":
+        InterruptedEnv.left = 12
+    elif moment == "while saving the best model":
+        monkeypatch.setattr(CRCSAC, "save", interrupt)
+    else:
+        real = np.savez
+        calls = []
+
+        def stopped(file: Any, **arrays: np.ndarray) -> None:
+            assert hasattr(file, "write"), "a kill while SB3 writes to its path would leave half a file"
+            calls.append(file)
+            if len(calls) == 1:
+                raise KeyboardInterrupt
+            real(file, **arrays)
+
+        monkeypatch.setattr(np, "savez", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(10, callback=callback, reset_num_timesteps=False)
+    with np.load(tmp_path / "evaluations.npz") as evaluations:
+        complete = 1 if moment == "within an episode" else 2
+        assert evaluations["timesteps"].tolist() == [10, 20][:complete]
+        assert evaluations["results"].shape == evaluations["ep_lengths"].shape == (complete, 5)
+    assert not [path.name for path in tmp_path.iterdir() if path.name not in ("evaluations.npz", "best_model.zip")]

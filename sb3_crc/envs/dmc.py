@@ -1,36 +1,30 @@
 """dm_control suite tasks for Stable-Baselines3: byte pictures, channel first, one rendering per decision.
 
-The chain, inside out: dm_control -> Shimmy -> :class:`SimulatorStep` -> (RescaleAction) -> RepeatAction ->
-AddRenderObservation -> :class:`PixelStack`. The picture is taken outside the repeat: rendering is by far the dearest part of
-a simulator step.
+The chain, inside out: dm_control -> Shimmy -> SimulatorStep -> (RescaleAction) -> RepeatAction -> AddRenderObservation ->
+:class:`PixelStack`. The picture is taken outside the repeat: rendering is by far the dearest part of a simulator step.
 
 Dimensions: C channels, S picture side (pixels), k stacked frames, A action.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections import deque
-from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.rendering import RenderingUnavailable, select_backend
+from sb3_crc.envs.simulator import LARGE_PICTURE, Action, Observation, SimulatorStep, StepResult, load_simulator
+from sb3_crc.envs.state import State, check_state
 from sb3_crc.envs.tasks import default_action_repeat, default_camera, split_task
 
 RENDER_QUALITIES = ("benchmark", "fast")
-OBSERVATIONS = ("pixels", "state")
+OBSERVATIONS = ("pixels", "state", "dict")
 FRAME_CHANNELS = 3
-LARGE_PICTURE = 480  # side of render()'s picture in pixels: all that fits the suite's 640 x 480 off-screen buffer
-UNLIMITED = 1e9  # dm_control writes +-1e10 for an actuator without limits
-
-Observation = Any
-Action = Any
-StepResult = tuple[Observation, float, bool, bool, dict[str, Any]]
+IMAGE_KEY = "pixels"
 
 
 def make_dmc(
@@ -65,10 +59,12 @@ def make_dmc(
         multisampling, shadows and reflections, 5 to 10 times cheaper in software OpenGL: for tests and search, not for
         results that are to be compared
     :param observation: "pixels": uint8 (3 k, S, S), channel first and contiguous, newest frame last, the first frame repeated
-        after a reset; "state": float32 (n,), the task's own observations side by side in alphabetical order of their names
+        after a reset; "state": float32 (n,), the task's own observations side by side in alphabetical order of their names;
+        "dict": the stack under "pixels" and each of the task's own observations under its name, float32 (n,)
     :param render_mode: "rgb_array", or None if ``render()`` is not needed
-    :return: the environment; it has the attributes ``action_repeat`` and, for pixels, ``frame_channels``
-    :raises ValueError: for an unknown task or a value that is not allowed
+    :return: the environment; it has the attributes ``action_repeat`` and, with pictures, ``frame_channels``; its whole state
+        can be saved, see :meth:`DecisionEnv.get_state`
+    :raises ValueError: for an unknown task or a value that is not allowed, with the nearest one that is
     :raises RenderingUnavailable: if pixels are wanted and no OpenGL back end can draw
     """
     domain, subtask = split_task(task)
@@ -81,7 +77,8 @@ def make_dmc(
     for name, value in (("image_size", image_size), ("action_repeat", action_repeat), ("frame_stack", frame_stack)):
         _check_integer(name, value, lowest=1)
 
-    simulator = _load_simulator(domain, subtask, seed, needs_rendering=observation == "pixels" or task == "quadruped-escape")
+    has_pictures = observation != "state"
+    simulator = load_simulator(domain, subtask, seed, needs_rendering=has_pictures or task == "quadruped-escape")
     cameras = simulator.physics.model.ncam
     _check_integer("camera_id", camera_id, lowest=-1, highest=cameras - 1, what=f"; {task} has {cameras} cameras")
 
@@ -97,92 +94,24 @@ def make_dmc(
     if np.any(env.action_space.low != -1.0) or np.any(env.action_space.high != 1.0):  # type: ignore[attr-defined]
         env = gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
     env = gym.wrappers.RepeatAction(env, action_repeat)
+    settings = {"task": task, "observation": observation, "action_repeat": int(action_repeat)}
     made: DecisionEnv
-    if observation == "pixels":
-        env = gym.wrappers.AddRenderObservation(env, render_only=True)
-        made = PixelStack(env, action_repeat, frame_stack, render_mode=render_mode)
+    if has_pictures:
+        pictures = {"image_size": int(image_size), "frame_stack": int(frame_stack), "camera_id": int(camera_id)}
+        settings |= {**pictures, "render_quality": render_quality}
+        env = gym.wrappers.AddRenderObservation(env, render_only=observation == "pixels", render_key=IMAGE_KEY)
+        stack = PixelStack if observation == "pixels" else DictStack
+        made = stack(env, action_repeat, frame_stack, render_mode=render_mode, settings=settings)
     else:
+        env.reset()  # as AddRenderObservation does: tasks measure their bodies at a reset, and set_state() needs none
         env = gym.wrappers.FlattenObservation(env)
         space = Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
         env = gym.wrappers.TransformObservation(env, _single_precision, space)
-        made = DecisionEnv(env, action_repeat, render_mode=render_mode)
-    # AddRenderObservation has already reset once to learn the picture's shape: the seed is for the user's first reset.
-    counter.pending_seed = seed
+        made = DecisionEnv(env, action_repeat, render_mode=render_mode, settings=settings)
+    counter.await_reset(seed)
     if seed is not None:
         made.action_space.seed(seed)
     return made
-
-
-class SimulatorStep(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Count simulator steps, keep the renderer's settings, and take float32 actions.
-
-    :param env: Shimmy's environment around a dm_control task
-    :param fast: draw without multisampling and shadows
-    :param buffer_size: side in pixels of the largest picture that will be drawn
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], *, fast: bool = False, buffer_size: int = LARGE_PICTURE) -> None:
-        RecordConstructorArgs.__init__(self, fast=fast, buffer_size=buffer_size)
-        super().__init__(env)
-        self.pending_seed: int | None = None
-        self.env_steps = 0
-        self.episode_env_steps = 0
-        self._episode_over = True
-        self._fast = fast
-        self._buffer_size = buffer_size
-        self._prepared_model: Any = None
-        self._prepare_renderer()
-        space = env.action_space
-        assert isinstance(space, Box)
-        if np.any(np.abs(space.low) > UNLIMITED) or np.any(np.abs(space.high) > UNLIMITED):
-            self.action_space = Box(-1.0, 1.0, space.shape, np.float32)
-        else:
-            self.action_space = Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
-
-    def _prepare_renderer(self) -> None:
-        """Write the quality into the model, where the OpenGL context reads it once, at the first picture."""
-        model = self.get_wrapper_attr("physics").model
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, self._buffer_size)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, self._buffer_size)
-        if self._fast:
-            model.vis.quality.offsamples = 0
-            model.vis.quality.shadowsize = 0
-        self._prepared_model = model
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; without a seed of its own the first one uses ``pending_seed``.
-
-        A seeded reset makes the environment as good as new, its counter included: Gymnasium's ``check_env`` requires that
-        everything after it repeats exactly, ``info`` too.
-        """
-        if seed is not None:
-            self.env_steps = 0
-        seed = self.pending_seed if seed is None else seed
-        self.pending_seed = None
-        observation, info = self.env.reset(seed=seed, options=options)
-        if self.get_wrapper_attr("physics").model is not self._prepared_model:  # a task may compile a new model
-            self._prepare_renderer()
-        self.episode_env_steps = 0
-        self._episode_over = False
-        return observation, self._with_counts(info)
-
-    def step(self, action: Action) -> StepResult:
-        """Advance the simulation by one control step.
-
-        :raises ResetNeeded: if the episode is over; dm_control would silently start another one and ignore the action
-        """
-        if self._episode_over:
-            raise ResetNeeded("The episode is over: call reset() before the next step().")
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.env_steps += 1
-        self.episode_env_steps += 1
-        self._episode_over = terminated or truncated
-        return observation, float(reward), terminated, truncated, self._with_counts(info)
-
-    def _with_counts(self, info: dict[str, Any]) -> dict[str, Any]:
-        info["env_steps"] = self.env_steps
-        info["episode_env_steps"] = self.episode_env_steps
-        return info
 
 
 class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -191,13 +120,22 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     :param env: the environment, which already repeats actions
     :param action_repeat: simulator steps per decision
     :param render_mode: "rgb_array" or None
+    :param settings: JSON scalars that a state must share to be accepted by :meth:`set_state`
     """
 
-    def __init__(self, env: gym.Env[Any, Any], action_repeat: int, *, render_mode: str | None = "rgb_array") -> None:
-        RecordConstructorArgs.__init__(self, action_repeat=action_repeat, render_mode=render_mode)
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        action_repeat: int,
+        *,
+        render_mode: str | None = "rgb_array",
+        settings: dict[str, Any] | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, action_repeat=action_repeat, render_mode=render_mode, settings=settings)
         super().__init__(env)
         self.action_repeat = action_repeat
         self._render_mode = render_mode
+        self._settings = settings or {}
         # Shimmy writes a wrong rate into a dict shared by all its environments: the last one made would set everybody's.
         control_timestep = float(self.get_wrapper_attr("control_timestep")())  # seconds
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1.0 / (control_timestep * action_repeat)}
@@ -220,6 +158,36 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         # dm_control returns a view with a negative stride, which torch and video encoders refuse.
         return np.ascontiguousarray(self.get_wrapper_attr("physics").render(**render_kwargs))
 
+    def get_state(self) -> State:
+        """Everything on which the future of this environment depends, random numbers of later resets and actions included.
+
+        Set into another environment of the same settings, whatever its seed and past, the state makes it continue exactly:
+        observations, rewards, ends and infos are equal to the last bit, also after the next resets. Through a VecEnv:
+        ``venv.env_method("get_state")``. Wrappers further out, such as SB3's Monitor, have a state of their own.
+
+        :return: nested dictionaries of NumPy arrays, strings, booleans, numbers and None, for ``np.savez`` and JSON
+        """
+        return {
+            "settings": dict(self._settings),
+            "simulator": self.get_wrapper_attr("get_simulator_state")(),
+            "action_space": self.action_space.np_random.bit_generator.state,
+        }
+
+    def set_state(self, state: State) -> None:
+        """Continue where :meth:`get_state` was called; no reset is needed.
+
+        Under SB3's Monitor, which wants a ``reset()`` before the first ``step()``, call ``reset()`` first and this then.
+
+        :param state: of an environment of the same settings; it is copied
+        :raises ValueError: if the settings differ, naming both, or if the state is damaged; nothing is changed then
+        """
+        check_state(state, self.get_state())
+        self._set_checked_state(state)
+
+    def _set_checked_state(self, state: State) -> None:
+        self.get_wrapper_attr("set_simulator_state")(state["simulator"])
+        self.action_space.np_random.bit_generator.state = state["action_space"]
+
 
 class PixelStack(DecisionEnv):
     """Turn (S, S, 3) pictures into contiguous (3 k, S, S) stacks, newest frame last, repeating the first after a reset.
@@ -228,64 +196,110 @@ class PixelStack(DecisionEnv):
     :param action_repeat: simulator steps per decision
     :param frame_stack: number k of frames
     :param render_mode: "rgb_array" or None
+    :param settings: JSON scalars that a state must share to be accepted by :meth:`set_state`
     """
 
     frame_channels = FRAME_CHANNELS
 
     def __init__(
-        self, env: gym.Env[Any, Any], action_repeat: int, frame_stack: int = 3, *, render_mode: str | None = "rgb_array"
+        self,
+        env: gym.Env[Any, Any],
+        action_repeat: int,
+        frame_stack: int = 3,
+        *,
+        render_mode: str | None = "rgb_array",
+        settings: dict[str, Any] | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, action_repeat=action_repeat, frame_stack=frame_stack, render_mode=render_mode)
-        super().__init__(env, action_repeat, render_mode=render_mode)
-        assert env.observation_space.shape is not None
-        height, width, channels = env.observation_space.shape
-        self.observation_space = Box(0, 255, (channels * frame_stack, height, width), np.uint8)
+        super().__init__(env, action_repeat, render_mode=render_mode, settings=settings)
+        RecordConstructorArgs.__init__(
+            self, action_repeat=action_repeat, frame_stack=frame_stack, render_mode=render_mode, settings=settings
+        )
+        picture_space = self._picture(env.observation_space)
+        height, width, channels = picture_space.shape
+        self._stack_space = Box(0, 255, (channels * frame_stack, height, width), np.uint8)
+        self.observation_space = self._space()
         self._frame_stack = frame_stack
         self._frames: deque[np.ndarray] = deque(maxlen=frame_stack)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; all k frames of the stack are the first picture (as CURL and DrQ do; SB3's own stack is black)."""
-        picture, info = self.env.reset(seed=seed, options=options)
-        self._frames.extend([_channel_first(picture)] * self._frame_stack)
-        return np.concatenate(self._frames), info
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._frames.extend([_channel_first(self._picture(observation))] * self._frame_stack)
+        return self._stacked(observation), info
 
     def step(self, action: Action) -> StepResult:
         """One decision: the rewards of its simulator steps summed, the picture after the last of them.
 
         :raises ResetNeeded: if the episode is over or none was started
         """
-        if not self._frames:
-            raise ResetNeeded("Call reset() before the first step().")
-        picture, reward, terminated, truncated, info = self.env.step(action)
-        self._frames.append(_channel_first(picture))
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._frames.append(_channel_first(self._picture(observation)))
+        return self._stacked(observation), float(reward), terminated, truncated, info
+
+    def _picture(self, observation: Any) -> Any:
+        return observation
+
+    def _space(self) -> Space[Any]:
+        return self._stack_space
+
+    def _stacked(self, observation: Observation) -> Observation:
         # A new array every time: an observation that was handed out never changes.
-        return np.concatenate(self._frames), float(reward), terminated, truncated, info  # (3 k, S, S)
+        return np.concatenate(self._frames)  # (3 k, S, S)
+
+    def get_state(self) -> State:
+        """As :meth:`DecisionEnv.get_state`, with the stacked frames."""
+        frames = np.concatenate(self._frames) if self._frames else np.zeros(self._stack_space.shape, np.uint8)
+        return {**super().get_state(), "frames": frames, "has_frames": bool(self._frames)}
+
+    def _set_checked_state(self, state: State) -> None:
+        super()._set_checked_state(state)
+        self._frames.clear()
+        if state["has_frames"]:
+            self._frames.extend(np.split(state["frames"].copy(), self._frame_stack))
+
+
+class DictStack(PixelStack):
+    """The stack of a :class:`PixelStack` under "pixels", beside the task's own observations as float32 (n,).
+
+    :param env: an environment whose observations are a dictionary with uint8 (S, S, 3) under "pixels"
+    """
+
+    image_key = IMAGE_KEY
+
+    def _picture(self, observation: Any) -> Any:
+        return observation[IMAGE_KEY]  # of an observation or of the space
+
+    def _space(self) -> Space[Any]:
+        assert isinstance(self.env.observation_space, Dict)
+        own = {
+            name: Box(-np.inf, np.inf, space.shape or (1,), np.float32)
+            for name, space in self.env.observation_space.items()
+            if name != IMAGE_KEY
+        }
+        return Dict({**own, IMAGE_KEY: self._stack_space})
+
+    def _stacked(self, observation: Observation) -> Observation:
+        own = {name: np.array(value, np.float32, ndmin=1) for name, value in observation.items() if name != IMAGE_KEY}
+        return {**own, IMAGE_KEY: np.concatenate(self._frames)}
 
 
 def _channel_first(picture: np.ndarray) -> np.ndarray:
-    """Copy (S, S, 3), which dm_control returns upside down in memory, to contiguous (3, S, S)."""
-    return np.ascontiguousarray(picture.transpose(2, 0, 1))
+    """Copy (S, S, 3), a view that the next picture overwrites, to contiguous (3, S, S)."""
+    return np.array(picture.transpose(2, 0, 1), order="C")
 
 
 def _single_precision(state: np.ndarray) -> np.ndarray:
     return state.astype(np.float32)
 
 
-def _load_simulator(domain: str, subtask: str, seed: int | None, *, needs_rendering: bool) -> Any:
-    """Load the task, with a back end chosen before dm_control's first import binds one."""
-    if needs_rendering:  # quadruped-escape uploads its terrain to OpenGL at every reset, pixels or not
-        select_backend()
-    else:  # states need no pictures, but pixels may follow in this process
-        with suppress(RenderingUnavailable):
-            select_backend()
-    from dm_control import suite
-
-    return suite.load(domain, subtask, task_kwargs={"random": seed})
-
-
 def _check_choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name}={value!r} is not known; it must be one of {', '.join(map(repr, allowed))}.")
+    if value in allowed:
+        return
+    message = f"{name}={value!r} is not known; it must be one of {', '.join(map(repr, allowed))}."
+    if isinstance(value, str):
+        nearest = difflib.get_close_matches(value, [known for known in allowed if isinstance(known, str)], n=1, cutoff=0.0)
+        message += f" Did you mean {nearest[0]!r}?"
+    raise ValueError(message)
 
 
 def _check_integer(name: str, value: object, *, lowest: int, highest: int | None = None, what: str = "") -> None:

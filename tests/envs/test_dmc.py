@@ -12,9 +12,9 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_crc.envs.dmc import DecisionEnv, PixelStack, make_dmc
+from sb3_crc.envs.simulator import SimulatorStep
 from sb3_crc.envs.tasks import PAPER_TASKS
 
 SMALL: dict[str, Any] = {"image_size": 36, "render_quality": "fast"}
@@ -24,17 +24,18 @@ def make_small(task: str = "cartpole-swingup", **kwargs: Any) -> DecisionEnv:
     return make_dmc(task, **{**SMALL, **kwargs})
 
 
-def count_renderings(env: DecisionEnv, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def count_renderings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Record the height of every picture that the simulator draws."""
-    physics = env.get_wrapper_attr("physics")
-    draw = physics.render
+    from dm_control.mujoco.engine import Camera
+
+    draw = Camera.render
     heights: list[int] = []
 
-    def counted(**kwargs: Any) -> np.ndarray:
-        heights.append(kwargs["height"])
-        return draw(**kwargs)
+    def counted(camera: Camera, *args: Any, **kwargs: Any) -> np.ndarray:
+        heights.append(camera.height)
+        return draw(camera, *args, **kwargs)
 
-    monkeypatch.setattr(physics, "render", counted)
+    monkeypatch.setattr(Camera, "render", counted)
     return heights
 
 
@@ -93,7 +94,7 @@ def test_observations_handed_out_never_change() -> None:
 
 def test_one_rendering_per_decision(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_small()
-    heights = count_renderings(env, monkeypatch)
+    heights = count_renderings(monkeypatch)
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(1, np.float32))
@@ -103,7 +104,7 @@ def test_one_rendering_per_decision(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_state_observation_draws_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_dmc("cartpole-swingup", observation="state", seed=0)
-    heights = count_renderings(env, monkeypatch)
+    heights = count_renderings(monkeypatch)
     state, info = env.reset()
     assert env.observation_space == gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
     assert state.dtype == np.float32 and info["env_steps"] == 0
@@ -161,9 +162,12 @@ def test_discount_zero_terminates(monkeypatch: pytest.MonkeyPatch) -> None:
     assert info["episode_env_steps"] == 6  # the end inside the repeat: control step 0.01 s
 
 
-def test_stepping_before_the_first_reset_is_refused() -> None:
+@pytest.mark.parametrize("observation", ["pixels", "state", "dict"])
+def test_stepping_before_the_first_reset_is_refused(observation: str) -> None:
     with pytest.raises(ResetNeeded):
-        make_small().step(np.zeros(1, np.float32))
+        make_small(observation=observation).step(np.zeros(1, np.float32))
+    with pytest.raises(ResetNeeded):
+        gym.make("dmc_pixels/cartpole-swingup-v0", **SMALL, observation=observation).step(np.zeros(1, np.float32))
 
 
 def test_actions_are_rescaled_to_the_tasks_bounds() -> None:
@@ -316,9 +320,16 @@ def test_render_mode_none_draws_observations_only() -> None:
         ("cartpole-swing_up", {}, "Did you mean 'cartpole-swingup'"),
         ("cartpol-swingup", {}, "Did you mean 'cartpole-swingup'"),
         ("ball-in-cup-catch", {}, "Did you mean 'ball_in_cup-catch'"),
-        ("cartpole-swingup", {"observation": "dict"}, "observation='dict'.*'pixels', 'state'"),
-        ("cartpole-swingup", {"render_quality": "best"}, "render_quality='best'.*'benchmark', 'fast'"),
-        ("cartpole-swingup", {"render_mode": "human"}, "render_mode='human'.*'rgb_array', None"),
+        ("cartpole-Swingup", {}, "Did you mean 'cartpole-swingup'"),
+        (
+            "cartpole-swingup",
+            {"observation": "pixel"},
+            "observation='pixel'.*'state', 'dict'.*Did you mean 'pixels'",
+        ),
+        ("cartpole-swingup", {"observation": 3}, "observation=3.*'pixels', 'state', 'dict'"),
+        ("cartpole-swingup", {"render_quality": "fats"}, "render_quality='fats'.*'benchmark', 'fast'.*Did you mean 'fast'"),
+        ("cartpole-swingup", {"render_quality": "bench"}, "render_quality='bench'.*Did you mean 'benchmark'"),
+        ("cartpole-swingup", {"render_mode": "human"}, "render_mode='human'.*'rgb_array', None.*Did you mean 'rgb_array'"),
         ("cartpole-swingup", {"image_size": 0}, "image_size=0"),
         ("cartpole-swingup", {"image_size": 84.0}, "image_size=84.0"),
         ("cartpole-swingup", {"action_repeat": 0}, "action_repeat=0"),
@@ -352,7 +363,7 @@ def test_check_env_of_states() -> None:
 
 def test_gymnasium_makes_it_by_id() -> None:
     env = gym.make("dmc_pixels/reacher-easy-v0", render_mode="rgb_array", image_size=36, render_quality="fast")
-    assert isinstance(env.env, PixelStack)  # type: ignore[attr-defined]
+    assert isinstance(env, PixelStack)
     assert env.reset(seed=0)[0].shape == (9, 36, 36)
     assert env.metadata["render_fps"] == pytest.approx(1 / (0.02 * 4))
     remade = gym.make(env.spec)  # type: ignore[arg-type]
@@ -361,25 +372,13 @@ def test_gymnasium_makes_it_by_id() -> None:
     remade.close()
 
 
-def test_monitor_counts_decisions() -> None:
-    venv = make_vec_env("sb3_crc:dmc_pixels/cartpole-swingup-v0", n_envs=1, seed=0, env_kwargs=SMALL)
-    venv.reset()
-    for decision in range(1, 126):
-        _, _, dones, infos = venv.step(np.zeros((1, 1), np.float32))
-        assert dones[0] == (decision == 125)
-    assert infos[0]["episode"]["l"] == 125
-    assert infos[0]["TimeLimit.truncated"] and infos[0]["episode_env_steps"] == 1000
-    assert infos[0]["terminal_observation"].shape == (9, 36, 36)
-    venv.close()
-
-
 def test_our_wrappers_cost_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rendering and Shimmy replaced by constants, what remains is Gymnasium's and our wrappers."""
     env = make_dmc("cartpole-swingup", seed=0)
     env.reset()
     picture = env.unwrapped.render()
     result = env.unwrapped.step(np.zeros(1))
-    monkeypatch.setattr(env.unwrapped, "render", lambda: picture)
+    monkeypatch.setattr(SimulatorStep, "render", lambda _: picture)
     monkeypatch.setattr(env.unwrapped, "step", lambda action: (*result[:4], dict(result[4])))
     action = np.zeros(1, np.float32)
     durations = []

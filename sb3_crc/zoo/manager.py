@@ -1,0 +1,192 @@
+"""One run, or one search, of the zoo."""
+
+import copy
+import importlib.util
+import logging
+import os
+import shlex
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import optuna
+import rl_zoo3.hyperparams_opt
+import yaml
+from filelock import FileLock
+from optuna.trial import TrialState
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
+from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_crc.analysis.films import film
+from sb3_crc.experiments.curves import plot_learning_curve
+from sb3_crc.presets import PRESETS
+from sb3_crc.zoo.messages import say
+from sb3_crc.zoo.search import ARGUMENTS, constructor_arguments, sample
+
+logger = logging.getLogger(__name__)
+
+CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
+SQLITE = "sqlite:///"
+
+
+class CRCExperimentManager(ExperimentManager):
+    """
+    The zoo's manager, which also finds our configurations, logs into the run's folder, draws what was learned, and keeps what
+    a search does not draw. Arguments are the zoo's.
+    """
+
+    def __init__(self, args: Any, algo: str, *rest: Any, **kwargs: Any):
+        own_config = CONFIGS / f"{algo}.yml"
+        if kwargs.get("config") is None and own_config.exists():
+            kwargs["config"] = str(own_config)
+        super().__init__(args, algo, *rest, **kwargs)
+        self._configuration: dict[str, Any] = {}
+        self._study: optuna.Study | None = None
+
+    # -- Configuration -------------------------------------------------------------------------------------------------
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        As in the zoo; the trial of ``--trial-id`` (which may be 0) replaces what it drew and nothing else.
+
+        :return: two mappings of the same content: one to be consumed, one to be saved
+        """
+        trial_id, self.trial_id = self.trial_id, None
+        consumed, saved = super().read_hyperparameters()
+        if trial_id is not None and self.storage and self.study_name and self.algo in PRESETS:
+            parameters = self.load_trial(self.storage, self.study_name, trial_id, convert=False)
+            drawn = constructor_arguments({**PRESETS[self.algo], **saved}, parameters)
+            drawn = {name: value for name, value in drawn.items() if name not in (self.custom_hyperparams or {})}
+            say(f"Trial {trial_id} of {self.study_name}: {drawn}")
+            consumed.update(drawn)
+            saved.update(drawn)
+        self._configuration = copy.deepcopy(dict(saved))
+        return consumed, saved
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        if "ParallelTrainCallback" in str(hyperparams.get("callback")):
+            raise ValueError(
+                "callback: rl_zoo3's ParallelTrainCallback reloads the model as a stock SAC, so it cannot train "
+                f"{self.algo!r}; remove it from the configuration"
+            )
+        processed = super()._preprocess_hyperparams(hyperparams)
+        if self._eval_env_kwargs_args is None:  # rl_zoo3 2.9.2 forgets the YAML's env_kwargs in evaluation
+            self.eval_env_kwargs = self.env_kwargs
+        return processed
+
+    # -- Training ------------------------------------------------------------------------------------------------------
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """Train until done or interrupted (Ctrl-C), logging to ``progress.csv`` and TensorBoard."""
+        model.set_logger(self._make_logger(model))
+        super().learn(model)
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """Save the final model, draw the learning curve, film the best policy, and say how to go on."""
+        super().save_trained_model(model)
+        environment = self.create_envs(1, eval_env=True)
+        try:
+            self._draw_learning_curve(environment)
+            self._film(model, environment)
+        finally:
+            environment.close()
+        say(self._how_to_go_on(model.num_timesteps))
+
+    def _draw_learning_curve(self, environment: VecEnv) -> None:
+        evaluations = Path(self.save_path) / "evaluations.npz"
+        repeats = int(environment.get_attr("action_repeat")[0]) if environment.has_attr("action_repeat") else 1
+        if evaluations.exists():
+            plot_learning_curve(evaluations, evaluations.with_name("learning_curve.png"), action_repeat=repeats)
+
+    def _film(self, model: BaseAlgorithm, environment: VecEnv) -> None:
+        if importlib.util.find_spec("av") is None:
+            logger.warning("no policy.mp4: install the extra 'video' (pip install 'sb3-crc[video]')")
+            return
+        policy, best = model, Path(self.save_path) / "best_model.zip"
+        try:
+            if best.exists():
+                policy = type(model).load(best, device=model.device)
+        except Exception as error:  # whatever is wrong with that file, the run's own model can still be filmed
+            logger.warning("%s cannot be loaded (%s): policy.mp4 shows the final model instead", best, error)
+        unfinished = best.with_name(".unfinished.mp4")
+        try:
+            film(policy, environment, unfinished)
+            os.replace(unfinished, best.with_name("policy.mp4"))
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def _make_logger(self, model: BaseAlgorithm) -> Logger:
+        if self.tensorboard_log:
+            run_logger = configure_logger(self.verbose, self.tensorboard_log, type(model).__name__)
+            run_logger.output_formats.append(CSVOutputFormat(os.path.join(self.save_path, "progress.csv")))
+            return run_logger
+        formats = ["csv", *["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)]
+        return configure(self.save_path, formats + ["stdout"] * (self.verbose > 0))
+
+    def _how_to_go_on(self, done: int) -> str:
+        more = self.n_timesteps - done if done < self.n_timesteps else self.n_timesteps
+        state = "finished" if done >= self.n_timesteps else f"stopped at {done} of {self.n_timesteps} agent steps"
+        # The last of two equal flags counts, so the run's own command keeps its settings.
+        command = [*sys.orig_argv, "-i", os.path.join(self.save_path, f"{self.env_name}.zip"), "-n", str(more)]
+        return f"Training {state}. To go on: {shlex.join(command)}"
+
+    # -- Search --------------------------------------------------------------------------------------------------------
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """As in the zoo; a trial whose losses are no longer finite is pruned."""
+        self._study = trial.study
+        try:
+            return float(super().objective(trial))
+        except FloatingPointError as error:
+            logger.warning("%s", error)
+            raise optuna.TrialPruned(str(error)) from error
+
+    def hyperparameters_optimization(self) -> None:
+        """As in the zoo; the best trial is also written as a configuration that ``--conf-file`` takes."""
+        if self.algo in PRESETS:
+            configuration = {**PRESETS[self.algo], **self._hyperparams}
+            rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER[self.algo] = partial(sample, configuration)
+        prepare_storage(self.storage)
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:  # what Optuna raises when asked for the best of no trial
+            if self._completed_trials():
+                raise
+            say(f"No trial was completed, so there is no best one: {error}")
+            return
+        self._write_best_trial()
+
+    def _completed_trials(self) -> list[optuna.trial.FrozenTrial]:
+        return [] if self._study is None else self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+
+    def _write_best_trial(self) -> None:
+        if not self._completed_trials() or self._study is None:
+            return
+        best = self._study.best_trial
+        path = Path(self.log_folder) / self.algo / f"best_{(self.study_name or self.env_name).replace('/', '-')}.yml"
+        configuration = {**self._configuration, **best.user_attrs.get(ARGUMENTS, {})}
+        origin = (
+            f"# Trial {best.number} of the study {self._study.study_name}: mean return {best.value} of its last evaluation\n"
+        )
+        path.write_text(origin + yaml.safe_dump({self.env_name.gym_id: configuration}, sort_keys=False))
+        say(f"To train with trial {best.number}: --algo {self.algo} --env {self.env_name.gym_id} --conf-file {path}")
+
+
+def prepare_storage(storage: str | None) -> None:
+    """
+    Make the tables of an SQLite storage, one process at a time: of workers that start together all but one would fail.
+
+    :param storage: as in ``--storage``
+    """
+    if storage is None or not storage.startswith(SQLITE):
+        return
+    database = storage.removeprefix(SQLITE).partition("?")[0]
+    if database in ("", ":memory:"):
+        return
+    Path(database).parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{database}.lock"):
+        optuna.storages.get_storage(storage).remove_session()

@@ -1,0 +1,120 @@
+"""zoo_configs: every preset builds for real once; the other tasks name only what exists, with values that can work."""
+
+import inspect
+from argparse import Namespace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from stable_baselines3 import SAC
+
+from sb3_crc import CRCSAC, PRESETS, CRCPolicy, PixelEncoder, make_dmc
+from sb3_crc.augmentations import bind_augmentation, takes_size
+from sb3_crc.envs.tasks import ACTION_REPEATS, PAPER_TASKS, environment_id
+from sb3_crc.objectives import build_objectives
+from sb3_crc.schedules import check_learning_rate, lr_schedule
+from sb3_crc.settings import check_ranges
+from sb3_crc.zoo import CONFIGS, CRCExperimentManager, register
+
+CARTPOLE = "dmc_pixels/cartpole-swingup-v0"
+HARDER_TASKS = PAPER_TASKS[6:]
+ZOO_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
+
+CASES = [
+    pytest.param(path, env_id, settings, id=f"{path.stem}-{env_id}")
+    for path in sorted(CONFIGS.glob("*.yml"))
+    for env_id, settings in yaml.safe_load(path.read_text()).items()
+]
+
+
+def arguments(*functions: Any) -> dict[str, inspect.Parameter]:
+    return {name: value for function in functions for name, value in inspect.signature(function).parameters.items()}
+
+
+@pytest.mark.parametrize(("path", "env_id", "settings"), CASES)
+def test_every_setting_exists_and_can_work(path: Path, env_id: str, settings: dict[str, Any]) -> None:
+    """Otherwise a mistake would show only when somebody trains with it."""
+    known = arguments(SAC.__init__, CRCSAC.__init__)
+    assert set(settings) <= known.keys() | ZOO_KEYS
+    assert settings["policy"] == "CnnPolicy"
+    environment = {**{name: value.default for name, value in arguments(make_dmc).items()}, **settings["env_kwargs"]}
+    assert set(environment) == set(arguments(make_dmc))
+    policy_kwargs = dict(settings["policy_kwargs"])
+    assert set(policy_kwargs) <= set(arguments(CRCPolicy.__init__))
+    encoder_kwargs = policy_kwargs["features_extractor_kwargs"]
+    assert set(encoder_kwargs) <= set(arguments(PixelEncoder.__init__))
+
+    model = SimpleNamespace(**{**{name: value.default for name, value in known.items()}, **settings})
+    check_ranges(model)
+    for name in ("learning_rate", "qf_learning_rate", "encoder_learning_rate", "ent_coef_learning_rate"):
+        check_learning_rate(name, lr_schedule(getattr(model, name) or 0)(1))
+    assert model.batch_size <= model.learning_starts < settings["n_timesteps"]
+    assert model.learning_starts < model.buffer_size
+
+    shape = (3 * environment["frame_stack"], environment["image_size"], environment["image_size"])
+    side = round(0.84 * shape[1]) if takes_size(model.augmentation) else shape[1]
+    size = {"size": side} if takes_size(model.augmentation) else {}
+    bind_augmentation(model.augmentation, {**size, **(model.augmentation_kwargs or {})}, shape)
+    if "objectives" in settings:
+        space = make_space(shape)
+        encoder = PixelEncoder(space, **{**encoder_kwargs, "image_size": side, "channels": [2] * 4})
+        assert set(build_objectives(settings["objectives"], encoder, 2)) == set(settings["objectives"])
+
+
+def make_space(shape: tuple[int, int, int]) -> Any:
+    import gymnasium as gym
+    import numpy as np
+
+    return gym.spaces.Box(0, 255, shape, np.uint8)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_ten_tasks_of_the_paper_with_their_steps(preset: str) -> None:
+    configuration = yaml.safe_load((CONFIGS / f"{preset}.yml").read_text())
+    assert set(configuration) == {"default", *map(environment_id, PAPER_TASKS)}
+    for task in PAPER_TASKS:
+        settings = configuration[environment_id(task)]
+        repeat = settings["env_kwargs"]["action_repeat"]
+        assert settings["n_timesteps"] * repeat == (300_000 if task in HARDER_TASKS else 100_000), task
+        original = 8 if preset == "crc_release" else ACTION_REPEATS.get(task.partition("-")[0], 2)
+        assert repeat == original, task
+        cheetah = task == "cheetah-run" and preset != "crc_release"
+        assert settings["learning_rate"] == (2e-4 if cheetah else 1e-3), task
+        assert settings["batch_size"] == (128 if preset in ("rad", "crc_release") else 512), task
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_configuration_is_its_preset(preset: str) -> None:
+    """What differs is RAD's batch, which the file gives a source for, and what is written out beside the preset's."""
+    settings = yaml.safe_load((CONFIGS / f"{preset}.yml").read_text())[CARTPOLE]
+    for name, value in PRESETS[preset].items():
+        if isinstance(value, dict) and name == "policy_kwargs":
+            assert value.items() <= settings[name].items()
+        else:
+            assert settings[name] == value, name
+    defaults = arguments(SAC.__init__, CRCSAC.__init__)
+    departures = {
+        name
+        for name, value in settings.items()
+        if name not in ZOO_KEYS | {"policy", "policy_kwargs"} | PRESETS[preset].keys() and value != defaults[name].default
+    }
+    assert departures == ({"batch_size"} if preset == "rad" else set())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_builds_for_real(preset: str, tmp_path: Path) -> None:
+    register()
+    manager = CRCExperimentManager(Namespace(), preset, CARTPOLE, str(tmp_path), eval_freq=-1, verbose=0, device="cpu")
+    model, _ = manager.setup_experiment()
+    try:
+        assert manager.config == str(CONFIGS / f"{preset}.yml")
+        assert model.env.get_attr("action_repeat") == [8]
+        assert model.observation_space.shape == (9, 100, 100)
+        assert model.policy.key_encoder.input_shape == (9, 84, 84)
+        assert set(model.policy.objectives) == set(PRESETS[preset]["objectives"])
+        assert (model.batch_size, model.buffer_size) == (128 if preset in ("rad", "crc_release") else 512, 100_000)
+        assert manager.n_timesteps == 12_500
+    finally:
+        model.env.close()
