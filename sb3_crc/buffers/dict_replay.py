@@ -8,6 +8,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_crc.buffers.replay import FrameReplayBuffer
+from sb3_crc.buffers.rows import as_row, same_bytes
 from sb3_crc.image_spaces import image_key
 
 
@@ -51,17 +52,17 @@ class DictFrameReplayBuffer(FrameReplayBuffer, DictReplayBuffer):  # type: ignor
     def _images(self, obs: Any) -> Any:
         return obs[self.image_key]
 
-    def _continues(self, env: int, obs: Any, stack: np.ndarray) -> bool:
-        previous = self.pos - 1
-        return super()._continues(env, obs, stack) and all(
-            np.array_equal(values[previous, env], np.asarray(obs[key][env], values.dtype).reshape(values.shape[2:]))
-            for key, values in self.next_vectors.items()
+    def _continues(self, env: int, stack: np.ndarray, row: dict[str, np.ndarray]) -> bool:
+        return super()._continues(env, stack, row) and all(
+            same_bytes(values[self.pos - 1, env], row[f"vectors/{key}"][env]) for key, values in self.next_vectors.items()
         )
 
-    def _add_vectors(self, obs: Any, next_obs: Any) -> None:
-        for vectors, source in ((self.vectors, obs), (self.next_vectors, next_obs)):
-            for key, values in vectors.items():
-                values[self.pos] = np.asarray(source[key]).reshape(values.shape[1:])
+    def _vectors(self, obs: Any, next_obs: Any) -> dict[str, np.ndarray]:
+        return {
+            f"{part}/{key}": as_row(values, np.asarray(source[key]).reshape(values.shape[1:]))
+            for part, source in (("vectors", obs), ("next_vectors", next_obs))
+            for key, values in self.vectors.items()
+        }
 
     def _observations(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, *, following: bool) -> Any:
         vectors = self.next_vectors if following else self.vectors

@@ -8,7 +8,7 @@ segments that it no longer names: at any moment there is a whole buffer in the f
 import io
 import json
 import os
-import pickle
+import shutil
 import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -61,15 +61,14 @@ def save_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIO
     target = Path(path)
     target = target if target.suffix else _with_ending(target)
     if target.is_file():  # SB3's pickle makes way only for a whole buffer
-        new, old = (target.with_name(f".{target.name}.{os.getpid()}.{word}") for word in ("new", "old"))
-        buffer.segments = _write(buffer, _Folder(new), ())
-        os.replace(target, old)
-        os.replace(new, target)
-        old.unlink()
+        _fill(buffer, _beside(target, "new"))
+        os.replace(target, _beside(target, "old"))  # where loading finds it until the folder stands in its place
+        os.replace(_beside(target, "new"), target)
+        sync(target.parent)
     else:
-        folder = _Folder(target)
-        buffer.segments = _write(buffer, folder, buffer.segments)
-        folder.keep({segment.name for segment in buffer.segments})
+        _fill(buffer, target)
+    _beside(target, "old").unlink(missing_ok=True)
+    shutil.rmtree(_beside(target, "new"), ignore_errors=True)  # of an earlier save that was stopped
 
 
 def load_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIOBase) -> None:
@@ -81,29 +80,42 @@ def load_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIO
     :raises FileNotFoundError: if there is none
     :raises ValueError: if it is damaged, of a later format, or does not fit ``buffer``, which then stays as it was
     """
-    if isinstance(path, io.BufferedIOBase):
-        is_zip = zipfile.is_zipfile(path)
-        path.seek(0)
-        if is_zip:
-            with zipfile.ZipFile(path) as archive:
-                _read(buffer, _Archive(archive), "the stream")
+    source = path if isinstance(path, io.BufferedIOBase) else _find(Path(path))
+    with _one_error("the stream" if isinstance(source, io.BufferedIOBase) else str(source)):
+        if isinstance(source, Path) and source.is_dir():
+            _read(buffer, _Folder(source))
+        elif zipfile.is_zipfile(source):
+            with zipfile.ZipFile(source) as archive:
+                _read(buffer, _Archive(archive))
         else:
-            _read_pickle(buffer, path)
-        return
-    source = next((file for file in (Path(path), _with_ending(Path(path))) if file.exists()), None)
-    if source is None:
-        raise FileNotFoundError(f"there is no replay buffer {path}")
-    if source.is_dir():
-        _read(buffer, _Folder(source), str(source))
-    elif zipfile.is_zipfile(source):
-        with zipfile.ZipFile(source) as archive:
-            _read(buffer, _Archive(archive), str(source))
-    else:
-        _read_pickle(buffer, source)
+            if isinstance(source, io.BufferedIOBase):
+                source.seek(0)
+            _read_pickle(buffer, source)
+
+
+def _find(path: Path) -> Path:
+    targets = path, _with_ending(path)
+    for source in (*targets, *(_beside(target, "old") for target in targets)):
+        if source.is_file() or (source / INDEX).is_file():
+            return source
+    raise FileNotFoundError(f"there is no replay buffer {path}")
+
+
+@contextmanager
+def _one_error(name: str) -> Iterator[None]:
+    """Damaged bytes make pickle, zipfile and numpy raise nearly anything."""
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(f"the replay buffer in {name} cannot be loaded: {error}") from error
 
 
 def _with_ending(path: Path) -> Path:
     return path.with_name(f"{path.name}.pkl")
+
+
+def _beside(target: Path, word: str) -> Path:
+    return target.with_name(f".{target.name}.{word}")
 
 
 class _Folder:
@@ -125,9 +137,9 @@ class _Folder:
             yield file
 
     def keep(self, names: set[str]) -> None:
-        """Delete the segments, whole or not, that are not among the ``names``."""
+        """Delete the segments that are not among the ``names``, and what was not written to its end."""
         for file in self.path.iterdir():
-            if file.name.lstrip(".").startswith("frames-") and file.name not in names:
+            if file.name.lstrip(".").startswith(("frames-", f"{INDEX}.")) and file.name not in names:
                 file.unlink()
         sync(self.path)
 
@@ -148,6 +160,12 @@ class _Archive:
     def reading(self, name: str) -> Iterator[IO[bytes]]:
         with self.archive.open(name) as file:
             yield file
+
+
+def _fill(buffer: FrameReplayBuffer, target: Path) -> None:
+    folder = _Folder(target)
+    buffer.segments = _write(buffer, folder, buffer.segments)
+    folder.keep({segment.name for segment in buffer.segments})
 
 
 def _write(buffer: FrameReplayBuffer, container: _Folder | _Archive, written: tuple[Segment, ...]) -> tuple[Segment, ...]:
@@ -201,47 +219,40 @@ def _description(buffer: FrameReplayBuffer) -> dict[str, Any]:
     }
 
 
-def _read(buffer: FrameReplayBuffer, container: _Folder | _Archive, name: str) -> None:
-    if not container.has(INDEX):
-        raise FileNotFoundError(f"there is no replay buffer in {name}: {INDEX} is missing")
-    try:
-        with container.reading(INDEX) as file, np.load(file, allow_pickle=False) as index:
-            arrays = {key: index[key] for key in index.files}
-        header = json.loads(str(arrays.pop("header")))
-        if header["format"] > FORMAT:
-            raise ValueError(f"its format is {header['format']}, this version of sb3_crc reads up to {FORMAT}")
-        for key, own in _description(buffer).items():
-            if header[key] != own:
-                raise ValueError(f"{key} is {header[key]} there and {own} here")
-        loaded = buffer.empty_copy(header["buffer_size"] * header["n_envs"], header["frame_channels"])
-        loaded.store.first = loaded.store.end = header["first_frame"]
-        segments = tuple(Segment(**segment) for segment in header["segments"])
-        for segment in segments:
-            with container.reading(segment.name) as file:
-                frames = np.lib.format.read_array(file, allow_pickle=False)
-            if len(frames) != segment.end - segment.first:
-                raise ValueError(f"{segment.name} has {len(frames)} frames instead of {segment.end - segment.first}")
-            loaded.store.extend(frames[max(0, header["first_frame"] - segment.first) :])
-        if loaded.store.end != header["end_frame"]:
-            raise ValueError(f"there are frames up to {loaded.store.end} instead of {header['end_frame']}")
-        loaded.restore(arrays, header["pos"], full=header["full"], latest=header["latest"])
-    except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"the replay buffer in {name} cannot be loaded: {error}") from error
+def _read(buffer: FrameReplayBuffer, container: _Folder | _Archive) -> None:
+    with container.reading(INDEX) as file, np.load(file, allow_pickle=False) as index:
+        arrays = {key: index[key] for key in index.files}
+    header = json.loads(str(arrays.pop("header")))
+    if header["format"] > FORMAT:
+        raise ValueError(f"its format is {header['format']}, this version of sb3_crc reads up to {FORMAT}")
+    for key, own in _description(buffer).items():
+        if header[key] != own:
+            raise ValueError(f"{key} is {header[key]} there and {own} here")
+    loaded = buffer.empty_copy(header["buffer_size"] * header["n_envs"], header["frame_channels"])
+    loaded.store.first = loaded.store.end = header["first_frame"]
+    segments = tuple(Segment(**segment) for segment in header["segments"])
+    for segment in segments:
+        with container.reading(segment.name) as file:
+            frames = np.lib.format.read_array(file, allow_pickle=False)
+        expected = segment.end - segment.first, *loaded.store.shape
+        if frames.shape != expected:
+            raise ValueError(f"{segment.name} has frames {frames.shape} instead of {expected}")
+        loaded.store.extend(frames[max(0, header["first_frame"] - segment.first) :])
+    if loaded.store.end != header["end_frame"]:
+        raise ValueError(f"there are frames up to {loaded.store.end} instead of {header['end_frame']}")
+    loaded.restore(arrays, header["pos"], full=header["full"], latest=header["latest"])
+    loaded.segments = segments if isinstance(container, _Folder) else ()
     vars(buffer).update(vars(loaded))
-    buffer.segments = segments if isinstance(container, _Folder) else ()
 
 
 def _read_pickle(buffer: FrameReplayBuffer, source: Path | io.BufferedIOBase) -> None:
     """Store the transitions of SB3's ReplayBuffer one by one, in the rows that they have there."""
-    try:
-        other = load_from_pkl(source)
-    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError) as error:
-        raise ValueError(f"{source} is neither a saved replay buffer nor SB3's pickle of one: {error}") from error
+    other = load_from_pkl(source)
     if not isinstance(other, ReplayBuffer) or other.optimize_memory_usage:
-        raise ValueError(f"{source} holds a {type(other).__name__}, not a replay buffer with both obs and next_obs")
+        raise ValueError(f"it is a {type(other).__name__}, not a replay buffer with both obs and next_obs")
     for name in ("observation_space", "action_space", "n_envs"):
         if getattr(other, name) != getattr(buffer, name):
-            raise ValueError(f"{source}: {name} is {getattr(other, name)} there and {getattr(buffer, name)} here")
+            raise ValueError(f"{name} is {getattr(other, name)} there and {getattr(buffer, name)} here")
     if isinstance(other, FrameReplayBuffer):
         loaded = other
         loaded.n_steps, loaded.gamma, loaded.device = buffer.n_steps, buffer.gamma, buffer.device
@@ -249,9 +260,10 @@ def _read_pickle(buffer: FrameReplayBuffer, source: Path | io.BufferedIOBase) ->
         loaded = buffer.empty_copy(other.buffer_size * other.n_envs, buffer.frame_channels)
         oldest = other.pos if other.full else 0
         loaded.pos = oldest
+        timeouts = getattr(other, "timeouts", np.zeros_like(other.dones))  # which SB3 has had since 2.1
         for row in ((np.arange(other.size()) + oldest) % other.buffer_size).tolist():
             obs, next_obs = (_row(part, row) for part in (other.observations, other.next_observations))
-            infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in other.timeouts[row]]
+            infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in timeouts[row]]
             loaded.add(obs, next_obs, other.actions[row], other.rewards[row], other.dones[row], infos)
     vars(buffer).update(vars(loaded))
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from typing_extensions import Self
 
+from sb3_crc.buffers.rows import as_row, n_step_returns, same_bytes
 from sb3_crc.buffers.samples import FrameSamples, whole
 from sb3_crc.buffers.store import SLACK, FrameStacks, FrameStore
 from sb3_crc.memory import GIGABYTE, free_memory
@@ -110,6 +111,7 @@ class FrameReplayBuffer(ReplayBuffer):
 
     @device.setter
     def device(self, device: th.device | str) -> None:
+        """Move the frames there."""
         self._device = th.device(device)
         if hasattr(self, "store"):
             self.store.to(self._device)
@@ -124,7 +126,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self._warned:
             return
         self._warned = True
-        taken = len(self.store) * self.store.frame_bytes if self.store.allocated else 0
+        taken = self.store.taken_bytes
         available = free_memory(self.device) + taken
         if self.full_bytes > available:
             fits = int(USABLE * available / self.full_bytes * self.buffer_size * self.n_envs)
@@ -179,7 +181,10 @@ class FrameReplayBuffer(ReplayBuffer):
         """
         self.pos, self.full = pos, full
         for name, values in self.arrays().items():
-            values[: self.size()] = arrays[name]
+            room, stored = values[: self.size()], arrays[name]
+            if (stored.shape, stored.dtype) != (room.shape, room.dtype):
+                raise ValueError(f"{name} is {stored.dtype} {stored.shape} there and {room.dtype} {room.shape} here")
+            room[:] = stored
         self.latest = [Latest(self._stack(numbers), numbers) if numbers else Latest() for numbers in latest]
 
     def _stack(self, numbers: list[int]) -> np.ndarray:
@@ -205,33 +210,24 @@ class FrameReplayBuffer(ReplayBuffer):
         :param reward: ``(N,)``
         :param done: ``(N,)``
         :param infos: N dicts; ``TimeLimit.truncated`` is read
-        :raises ValueError: if ``next_obs`` is not ``obs`` shifted by one frame; the buffer stays as it was
+        :raises ValueError: for arguments of other shapes, or if ``next_obs`` is not ``obs`` shifted by one frame; the buffer
+            stays as it was
         """
         stacks, next_stacks = self._stacks(obs), self._stacks(next_obs)  # (N, k, C, H, W)
-        actions = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        row = self._vectors(obs, next_obs) | self._scalars(action, reward, done, infos)
         self._check_overlap(stacks, next_stacks)
         self.warn_if_too_large()
-        continues = [self._continues(env, obs, stacks[env]) for env in range(self.n_envs)]
-        self._drop_unused()
-        row = self.pos
-        for env in range(self.n_envs):
-            if continues[env]:
-                numbers = self.latest[env].numbers
-            else:
-                self._interrupt(env)
-                numbers = self._append_stack(stacks[env])
-            numbers = [*numbers, self.store.append(next_stacks[env, -1])]
-            self.frame_numbers[row, env] = numbers
-            self.latest[env] = Latest(next_stacks[env].copy(), numbers[1:])
-        self._add_vectors(obs, next_obs)
-        self.actions[row], self.rewards[row], self.dones[row] = actions, reward, done
-        self.interrupted[row] = False
-        if self.handle_timeout_termination:
-            self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
+        numbers = [self._append(env, stacks[env], next_stacks[env, -1], row) for env in range(self.n_envs)]
+        arrays = self.arrays()
+        for name, values in {**row, "frame_numbers": numbers, "interrupted": False}.items():
+            arrays[name][self.pos] = values
+        self.latest = [Latest(next_stacks[env].copy(), numbers[env][1:]) for env in range(self.n_envs)]
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full = True
             self.pos = 0
+        if self.full:  # numbers only rise: what the oldest row does not use, none uses
+            self.store.drop_before(int(self.frame_numbers[self.pos].min()))
 
     def interrupt(self) -> None:
         """Say that the environments were reset: what is added next does not continue what was added last."""
@@ -252,43 +248,52 @@ class FrameReplayBuffer(ReplayBuffer):
         shape = self.n_envs, *self._stacked_space().shape
         if images.shape != shape:
             raise ValueError(f"observations of shape {images.shape} do not fit the buffer, which stores {shape}")
-        return images.astype(self.store.dtype, copy=False).reshape(self.n_envs, self.stack_size, *self.store.shape)
+        stacks = np.ascontiguousarray(images, self.store.dtype)
+        return stacks.reshape(self.n_envs, self.stack_size, *self.store.shape)
+
+    def _scalars(
+        self, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
+    ) -> dict[str, np.ndarray]:
+        """:return: one row of each of these arrays"""
+        row: dict[str, Any] = {"rewards": reward, "dones": done, "timeouts": False}
+        row["actions"] = np.asarray(action).reshape(self.n_envs, self.action_dim)
+        if self.handle_timeout_termination:
+            row["timeouts"] = [info.get("TimeLimit.truncated", False) for info in infos]
+        return {name: as_row(getattr(self, name), values) for name, values in row.items()}
 
     def _check_overlap(self, stacks: np.ndarray, next_stacks: np.ndarray) -> None:
-        if np.array_equal(stacks[:, 1:], next_stacks[:, :-1]):
+        if same_bytes(stacks[:, 1:], next_stacks[:, :-1]):
             return
-        env = next(e for e in range(self.n_envs) if not np.array_equal(stacks[e, 1:], next_stacks[e, :-1]))
+        env = next(e for e in range(self.n_envs) if not same_bytes(stacks[e, 1:], next_stacks[e, :-1]))
         raise ValueError(
             f"transition {self.pos} of environment {env}: next_obs is not obs shifted by one frame of frame_channels="
             f"{self.frame_channels} channels. If observations are not stacks of frames, or something changes them after "
             "they are stacked, store them whole: replay_buffer_kwargs={'frame_channels': None}"
         )
 
-    def _continues(self, env: int, obs: Any, stack: np.ndarray) -> bool:
+    def _continues(self, env: int, stack: np.ndarray, row: dict[str, np.ndarray]) -> bool:
         latest = self.latest[env].stack
-        return latest is not None and np.array_equal(latest, stack)
+        return latest is not None and same_bytes(latest, stack)
 
     def _interrupt(self, env: int) -> None:
         if self.latest[env].stack is not None:
             self.interrupted[self.pos - 1, env] = not self.dones[self.pos - 1, env]
         self.latest[env] = Latest()
 
-    def _drop_unused(self) -> None:
-        """Before the row at ``pos`` is overwritten: drop the frames that it alone used."""
-        if not self.full:
-            return
-        used = [number for latest in self.latest for number in latest.numbers[:1]]
-        if self.buffer_size > 1:
-            used.append(int(self.frame_numbers[(self.pos + 1) % self.buffer_size].min()))
-        self.store.drop_before(min(used, default=self.store.end))
+    def _append(self, env: int, stack: np.ndarray, newest: np.ndarray, row: dict[str, np.ndarray]) -> list[int]:
+        """
+        Store what is new of a transition.
 
-    def _append_stack(self, stack: np.ndarray) -> list[int]:
-        """Store the frames of an episode's first observation, in which the first picture may stand k times."""
+        :return: numbers of its frames
+        """
+        if self._continues(env, stack, row):
+            return [*self.latest[env].numbers, self.store.append(newest)]
+        self._interrupt(env)
         numbers: list[int] = []
-        for index, frame in enumerate(stack):
-            same = index > 0 and np.array_equal(frame, stack[index - 1])
+        for index, frame in enumerate(stack):  # in an episode's first observation, the first picture may stand k times
+            same = index > 0 and same_bytes(frame, stack[index - 1])
             numbers.append(numbers[-1] if same else self.store.append(frame))
-        return numbers
+        return [*numbers, self.store.append(newest)]
 
     # -- Reading -------------------------------------------------------------------------------------------------------
 
@@ -307,11 +312,12 @@ class FrameReplayBuffer(ReplayBuffer):
 
     def _frame_samples(self, rows: np.ndarray, env: VecNormalize | None) -> FrameSamples:
         envs = np.random.randint(0, self.n_envs, size=rows.shape)  # as in SB3, also for a single one
-        last, rewards, discounts = rows, self.rewards[rows, envs][:, None], None
+        steps = (rows[:, None] + np.arange(self.n_steps)) % self.buffer_size, envs[:, None]  # (B, n)
+        rewards = self._normalize_reward(self.rewards[steps], env)
+        last, discounts = rows, None
         if self.n_steps > 1:
-            last, rewards, discounts = self._n_step_returns(rows, envs, env)
-        else:
-            rewards = self._normalize_reward(rewards, env)
+            taken, rewards, discounts = n_step_returns(rewards, self._ends(steps), self.gamma)
+            last = steps[0][np.arange(len(rows)), taken - 1]
         one_step = self._observations(rows, envs, env, following=True)
         return FrameSamples(
             self._observations(rows, envs, env, following=False),
@@ -323,22 +329,11 @@ class FrameReplayBuffer(ReplayBuffer):
             one_step,
         )
 
-    def _n_step_returns(
-        self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """:return: row of the last step ``(B,)``, sum of rewards ``(B, 1)``, discount of the value after it ``(B, 1)``"""
-        steps = np.arange(self.n_steps)
-        at = (rows[:, None] + steps) % self.buffer_size, envs[:, None]  # (B, n)
-        ends = (self.dones[at] > 0) | (self.timeouts[at] > 0) | self.interrupted[at]
-        ends |= at[0] == (self.pos - 1) % self.buffer_size  # what follows there is the oldest transition
-        ends[:, -1] = True
-        n = ends.argmax(axis=1)  # steps after the first
-        mask = steps <= n[:, None]
-        rewards = self._normalize_reward(self.rewards[at], env)
-        gammas = self.gamma ** steps.astype(np.float32)
-        returns = (rewards * gammas * mask).sum(axis=1, keepdims=True)
-        discounts = self.gamma ** mask.sum(axis=1, keepdims=True).astype(np.float32)
-        return at[0][np.arange(len(rows)), n], returns, discounts
+    def _ends(self, steps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """:return: whether what is stored after each of these steps is not what followed it"""
+        newest = steps[0] == (self.pos - 1) % self.buffer_size  # the oldest transition comes after it
+        ends: np.ndarray = (self.dones[steps] > 0) | (self.timeouts[steps] > 0) | self.interrupted[steps] | newest
+        return ends
 
     @property
     def observations(self) -> Any:  # type: ignore[override]
@@ -373,11 +368,16 @@ class FrameReplayBuffer(ReplayBuffer):
     def _images(self, obs: Any) -> Any:
         return obs
 
-    def _add_vectors(self, obs: Any, next_obs: Any) -> None:
-        pass
+    def _vectors(self, obs: Any, next_obs: Any) -> dict[str, np.ndarray]:
+        return {}
 
     def _observations(self, rows: np.ndarray, envs: np.ndarray, env: VecNormalize | None, *, following: bool) -> Any:
-        return self._frame_stacks(rows, envs, following)
+        stacks = self._frame_stacks(rows, envs, following)
+        if env is None or not env.norm_obs:
+            return stacks
+        normalized = self._normalize_obs(stacks.whole().cpu().numpy(), env)
+        assert isinstance(normalized, np.ndarray)
+        return self.to_torch(normalized)
 
 
 def _frames_of(shape: tuple[int, ...], frame_channels: int | None) -> tuple[int, tuple[int, ...]]:

@@ -50,14 +50,16 @@ class FrameStore:
         return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
 
     @property
-    def allocated(self) -> bool:
-        """Whether memory is taken already."""
-        return self._frames is not None
+    def taken_bytes(self) -> int:
+        """Memory that is taken already: on a CPU that of the frames that have come, on a GPU all of it at once."""
+        if self._frames is None:
+            return 0
+        return (len(self) if self.device.type == "cpu" else self.capacity) * self.frame_bytes
 
     def allocate(self) -> th.Tensor:
         """:return: the memory, ``(capacity, *shape)``, which is there from the first call on"""
         if self._frames is None:
-            self._frames = th.empty((self.capacity, *self.shape), dtype=self._torch_dtype, device=self.device)
+            self._frames = self._room(self.capacity)
         return self._frames
 
     def append(self, frame: np.ndarray) -> int:
@@ -69,7 +71,7 @@ class FrameStore:
         """
         if len(self) == self.capacity:
             self._grow(1)
-        self.allocate()[self.end % self.capacity] = th.from_numpy(np.ascontiguousarray(frame))
+        self.allocate()[self.end % self.capacity] = th.from_numpy(np.array(frame))
         self.end += 1
         return self.end - 1
 
@@ -102,7 +104,7 @@ class FrameStore:
         :return: the stacks, ``(B, k C, H, W)``
         """
         frames, places = self.allocate(), numbers % self.capacity
-        if frames.device.type == "cpu":  # numpy copies whole frames, several times faster than torch's index
+        if self.device.type == "cpu":  # numpy copies whole frames, several times faster than torch's index
             gathered = th.from_numpy(frames.numpy()[places])
         else:
             gathered = frames[th.from_numpy(places).to(frames.device)]
@@ -119,7 +121,7 @@ class FrameStore:
         :return: ``(B, k C, *size)``
         """
         frames, places = self.allocate(), numbers % self.capacity
-        if frames.device.type == "cpu":
+        if self.device.type == "cpu":
             views = np.lib.stride_tricks.sliding_window_view(frames.numpy(), size, axis=(2, 3))
             return _side_by_side(th.from_numpy(views[places, :, tops[:, None], lefts[:, None]]))
         at = [th.from_numpy(index).to(frames.device) for index in (places, tops, lefts)]
@@ -139,11 +141,16 @@ class FrameStore:
 
     def _grow(self, least: int) -> None:
         capacity = self.capacity + max(least, round(GROWTH * self.capacity))
-        old, old_capacity = self.allocate(), self.capacity
-        self._frames, self.capacity = None, capacity
-        for start in range(self.first, self.end, 1024):
-            numbers = th.arange(start, min(start + 1024, self.end), device=self.device)
-            self.allocate()[numbers % capacity] = old[numbers % old_capacity]
+        if self._frames is not None:
+            grown = self._room(capacity)  # where memory runs out here, the frames are still there
+            for start in range(self.first, self.end, 1024):
+                numbers = th.arange(start, min(start + 1024, self.end), device=self.device)
+                grown[numbers % capacity] = self._frames[numbers % self.capacity]
+            self._frames = grown
+        self.capacity = capacity
+
+    def _room(self, capacity: int) -> th.Tensor:
+        return th.empty((capacity, *self.shape), dtype=self._torch_dtype, device=self.device)
 
     def __getstate__(self) -> dict[str, Any]:
         # The memory that no frame has touched yet must not become bytes on a disk
@@ -151,6 +158,8 @@ class FrameStore:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({**state, "_frames": None, "end": state["first"]})
+        if self.device.type == "cuda" and not th.cuda.is_available():
+            self.device = th.device("cpu")  # a buffer can be loaded where there is no GPU, as SB3's can
         if len(state["_frames"]):
             self.extend(state["_frames"])
 
