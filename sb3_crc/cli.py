@@ -117,6 +117,19 @@ def ladder(
 
 
 @app.command()
+def trials(
+    runs: Annotated[list[Path], typer.Argument(help="folders of runs, <logs>/<algo>/<env>_<number>")],
+    output: Annotated[Path, typer.Option(help="CSV file to write into")] = Path("trials.csv"),
+    episodes: Annotated[int, typer.Option(min=0, help="fresh ones for the final policy of each finished run")] = 10,
+) -> None:
+    """Write runs into a table of trials: settings, curve, final return, time."""
+    from sb3_crc.experiments.trials import record_trials
+
+    for row in record_trials(runs, output, episodes=episodes):
+        console.print(f"{row['trial']}: {row.get('final_mean', 'not finished')}", soft_wrap=True, highlight=False)
+
+
+@app.command()
 def curve(
     run: Annotated[Path, typer.Argument(help="folder of a run, with its evaluations.npz")],
     output: Annotated[Path, typer.Option(help="picture to write")] = Path("learning_curve.png"),

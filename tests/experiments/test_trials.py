@@ -1,0 +1,56 @@
+"""The table of trials."""
+
+import csv
+import json
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_crc import CRCSAC, make_dmc
+from sb3_crc.experiments.trials import FIELDS, record_trials
+from tests.conftest import POLICY_KWARGS
+
+ENV = "dmc_pixels/cartpole-swingup-v0"
+ENV_KWARGS = {"image_size": 36, "frame_stack": 2, "render_quality": "fast", "action_repeat": 40}
+
+
+def make_run(folder: Path, *, finished: bool) -> Path:
+    """A folder as rl_zoo3 leaves it, with a policy that has learned nothing."""
+    name = "dmc_pixels-cartpole-swingup-v0"
+    run = folder / "crc" / f"{name}_1"
+    (run / name).mkdir(parents=True)
+    (run / name / "args.yml").write_text(yaml.dump(OrderedDict(algo="crc", env=ENV, seed=7)))
+    (run / name / "config.yml").write_text(yaml.dump(OrderedDict(gamma=0.9, env_kwargs=ENV_KWARGS)))
+    (run / "0.monitor.csv").write_text("#{}\nr,l,t\n1.0,25,30.0\n2.0,25,90.0\n")
+    np.savez(run / "evaluations.npz", timesteps=[25, 50], results=[[1.0, 2.0], [3.0, 5.0]])
+    if finished:
+        env = make_dmc("cartpole-swingup", seed=0, **ENV_KWARGS)
+        CRCSAC("CnnPolicy", env, buffer_size=10, policy_kwargs=POLICY_KWARGS).save(run / name)
+    return run
+
+
+def test_trials_are_read_evaluated_and_replaced(tmp_path: Path) -> None:
+    table = tmp_path / "results" / "trials.csv"
+    unfinished = make_run(tmp_path / "one", finished=False)
+    record_trials([unfinished], table)
+    run = make_run(tmp_path / "two", finished=True)
+    rows = record_trials([run], table, episodes=2)
+    assert 0 <= rows[0]["final_mean"] < 500
+    record_trials([unfinished], table)  # again: no second row
+    written = list(csv.DictReader(table.open()))
+    assert {row["trial"] for row in written} == {str(unfinished), str(run)} and len(written) == 2
+    for row in written:
+        assert (row["algo"], row["seed"], row["environment_steps"]) == ("crc", "7", "2000")
+        assert (row["curve"], row["minutes"]) == ("1000:2 2000:4", "1.5")
+        assert json.loads(row["settings"])["gamma"] == 0.9
+        assert bool(row["final_returns"]) == (row["trial"] == str(run))
+    assert set(FIELDS) < set(written[0])
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no run of rl_zoo3"):
+        record_trials([tmp_path], tmp_path / "trials.csv")
+    assert not (tmp_path / "trials.csv").exists()
