@@ -89,7 +89,10 @@ def baselines(
 
 @app.command()
 def ladder(
-    rung: Annotated[str, typer.Argument(help="state: SAC from states; probe: an untrained encoder; overfit: each loss alone")],
+    rung: Annotated[
+        str,
+        typer.Argument(help="state: SAC from states; probe: an untrained encoder; teach: a taught one; overfit: each loss"),
+    ],
     task: Annotated[str, typer.Argument(help="domain-task")] = "cartpole-swingup",
     output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
     config: Annotated[Path, typer.Option(help="rl-zoo file whose policy_kwargs are used")] = Path("zoo_configs/laptop.yml"),
@@ -98,7 +101,7 @@ def ladder(
     """Measure what must work before learning from pixels can."""
     import yaml
 
-    from sb3_crc.experiments.ladder import overfit_one_batch, probe_random_encoder, state_sac
+    from sb3_crc.experiments.ladder import overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
     from sb3_crc.objectives import OBJECTIVES
 
     policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
@@ -106,10 +109,12 @@ def ladder(
         measured: object = state_sac(task, seed=seed)
     elif rung == "probe":
         measured = probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+    elif rung == "teach":
+        measured = teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
     elif rung == "overfit":
         measured = [overfit_one_batch(task, name, policy_kwargs, seed=seed) for name in OBJECTIVES]
     else:
-        raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, overfit")
+        raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, teach, overfit")
     if output is None:
         console.print_json(data=measured)
     else:
@@ -121,11 +126,12 @@ def trials(
     runs: Annotated[list[Path], typer.Argument(help="folders of runs, <logs>/<algo>/<env>_<number>")],
     output: Annotated[Path, typer.Option(help="CSV file to write into")] = Path("trials.csv"),
     episodes: Annotated[int, typer.Option(min=0, help="fresh ones for the final policy of each finished run")] = 10,
+    note: Annotated[str, typer.Option(help="why it was tried, or why it was stopped")] = "",
 ) -> None:
     """Write runs into a table of trials: settings, curve, final return, time."""
     from sb3_crc.experiments.trials import record_trials
 
-    for row in record_trials(runs, output, episodes=episodes):
+    for row in record_trials(runs, output, episodes=episodes, note=note):
         console.print(f"{row['trial']}: {row.get('final_mean', 'not finished')}", soft_wrap=True, highlight=False)
 
 

@@ -1,7 +1,7 @@
 """The ladder under learning from pixels: what must work before the next rung is worth a try.
 
-State SAC shows that the environment can be learned at all, the probe what a latent knows before it has learned anything, and
-overfitting that each loss can be minimised. The rungs above are runs of ``train.py``.
+State SAC shows that the environment can be learned at all, the probe what a latent knows before it has learned anything,
+teaching what the encoder can see, and overfitting that each loss can be minimised. The rungs above are runs of ``train.py``.
 
 N frames, B batch, Z latent, S state.
 """
@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_crc.augmentations import random_shift
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
@@ -72,14 +74,64 @@ def probe_random_encoder(
     """
     images, states = _random_frames(task, frames, image_size, seed)
     th.manual_seed(seed)
-    space = make_dmc(task, image_size=image_size, render_quality="fast", seed=seed).observation_space
-    encoder = PixelEncoder(space, **encoder_kwargs)
+    encoder = PixelEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **encoder_kwargs)
     with th.no_grad():
         convolved = th.cat([encoder.convolve(th.from_numpy(part)) for part in np.array_split(images, max(1, frames // 256))])
         latents = encoder.project(convolved)
     looks = {"latent": latents.numpy(), "convolutions": convolved.numpy()}
     scores = {look: {name: linear_probe(inputs, values) for name, values in states.items()} for look, inputs in looks.items()}
     return {"task": task, "seed": seed, "frames": frames, "encoder": dict(encoder_kwargs), "r2": scores}
+
+
+def teach_encoder(
+    task: str,
+    encoder_kwargs: Mapping[str, Any],
+    *,
+    updates: int = 500,
+    frames: int = 4_000,
+    batch_size: int = 128,
+    learning_rate: float = 1e-3,
+    pad: int = 3,
+    image_size: int = 64,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """
+    How much of the state the encoder can learn to see, and how fast, when it is simply told: what no agent can exceed.
+
+    :param task: as for :func:`~sb3_crc.make_dmc`
+    :param encoder_kwargs: arguments of :class:`~sb3_crc.PixelEncoder`
+    :param updates: of encoder and a linear head, on the mean squared error of the standardised state
+    :param frames: stacks that are collected with random actions; the last fifth, later episodes, is held out
+    :param batch_size: frames per update
+    :param learning_rate: of Adam
+    :param pad: of the random shift
+    :param image_size: side of the frames in pixels, drawn in the fast quality
+    :param seed: of environment, actions and weights
+    :return: R^2 on held-out frames by the name of the task's observation (mean over its coordinates)
+    """
+    images, states = _random_frames(task, frames, image_size, seed)
+    split = round(0.8 * frames)
+    targets = np.concatenate([values.reshape(frames, -1) for values in states.values()], axis=1)
+    mean, std = targets[:split].mean(axis=0), targets[:split].std(axis=0) + 1e-6
+    pixels, standardised = th.from_numpy(images), th.as_tensor((targets - mean) / std, dtype=th.float32)
+    th.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    encoder = PixelEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **encoder_kwargs)
+    head = th.nn.Linear(encoder.features_dim, targets.shape[1])
+    optimizer = th.optim.Adam([*encoder.parameters(), *head.parameters()], lr=learning_rate)
+    for _ in range(updates):
+        rows = th.from_numpy(rng.integers(0, split, batch_size))
+        loss = (head(encoder(random_shift(pixels[rows], pad))) - standardised[rows]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with th.no_grad():
+        predicted = th.cat([head(encoder(part)) for part in th.split(pixels[split:], 256)]).numpy()
+    held_out = standardised[split:].numpy()
+    scores = 1 - ((predicted - held_out) ** 2).mean(axis=0) / held_out.var(axis=0).clip(1e-8)
+    sizes = np.cumsum([values.reshape(frames, -1).shape[1] for values in states.values()])[:-1]
+    r2 = {name: float(part.mean()) for name, part in zip(states, np.split(scores, sizes), strict=True)}
+    return {"task": task, "seed": seed, "frames": frames, "updates": updates, "encoder": dict(encoder_kwargs), "r2": r2}
 
 
 def linear_probe(inputs: np.ndarray, targets: np.ndarray, *, held_out: float = 0.2) -> float:

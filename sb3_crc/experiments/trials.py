@@ -14,7 +14,19 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_crc.crc_sac import CRCSAC
 
-FIELDS = ("trial", "algo", "env", "seed", "environment_steps", "curve", "final_mean", "final_std", "final_returns", "minutes")
+FIELDS = (
+    "trial",
+    "algo",
+    "env",
+    "seed",
+    "environment_steps",
+    "curve",
+    "final_mean",
+    "final_std",
+    "final_returns",
+    "minutes",
+    "note",
+)
 
 
 def read_trial(run: Path) -> dict[str, Any]:
@@ -58,18 +70,19 @@ def evaluate_run(run: Path, *, episodes: int = 10, seed: int = 10_000) -> list[f
     return [float(value) for value in returns]
 
 
-def record_trials(runs: Sequence[Path], table: Path, *, episodes: int = 10) -> list[dict[str, Any]]:
+def record_trials(runs: Sequence[Path], table: Path, *, episodes: int = 10, note: str = "") -> list[dict[str, Any]]:
     """
     Write runs into a table, each in the place of what it said before.
 
     :param runs: folders as for :func:`read_trial`
     :param table: CSV file, made if it is missing
     :param episodes: fresh ones on which the final policy of a finished run is evaluated; 0: none
+    :param note: written beside them
     :return: the new rows
     """
     rows = []
     for run in runs:
-        row = read_trial(run)
+        row = read_trial(run) | {"note": note}
         if _final_model(run).exists() and episodes > 0:
             returns = evaluate_run(run, episodes=episodes)
             row |= {"final_mean": round(float(np.mean(returns)), 1), "final_std": round(float(np.std(returns, ddof=1)), 1)}

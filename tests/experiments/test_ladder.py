@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
-from sb3_crc.experiments.ladder import linear_probe, overfit_one_batch, probe_random_encoder, state_sac
+from sb3_crc.experiments.ladder import linear_probe, overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
 
 SMALL = {"channels": [8, 8], "strides": [2, 2], "features_dim": 16}
 
@@ -29,6 +29,12 @@ def test_an_untrained_encoder_is_probed() -> None:
     assert measured["r2"]["convolutions"]["position"] > measured["r2"]["latent"]["position"]
 
 
+def test_a_taught_encoder_sees_more_than_an_untrained_one() -> None:
+    measured = {n: teach_encoder("cartpole-swingup", SMALL, updates=n, frames=800, image_size=36)["r2"] for n in (1, 150)}
+    assert set(measured[1]) == {"position", "velocity"}
+    assert measured[150]["position"] > max(measured[1]["position"], 0.3)
+
+
 def test_state_sac_reports_its_curve() -> None:
     measured = state_sac("cartpole-swingup", agent_steps=520, evaluations=2, episodes=2)
     assert [point["environment_steps"] for point in measured["curve"]] == [2080, 4160]
@@ -47,7 +53,7 @@ def test_the_command_writes_json_and_names_the_rungs(tmp_path: Path) -> None:
     config = tmp_path / "small.yml"
     config.write_text(f"default: {{policy_kwargs: {{features_extractor_kwargs: {json.dumps(SMALL)}}}}}")
     result = runner.invoke(app, ["ladder", "stairs", "--config", str(config)])
-    assert result.exit_code == 2 and "state, probe, overfit" in result.output
+    assert result.exit_code == 2 and "state, probe, teach, overfit" in result.output
 
 
 @pytest.mark.slow

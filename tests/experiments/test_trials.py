@@ -39,12 +39,13 @@ def test_trials_are_read_evaluated_and_replaced(tmp_path: Path) -> None:
     run = make_run(tmp_path / "two", finished=True)
     rows = record_trials([run], table, episodes=2)
     assert 0 <= rows[0]["final_mean"] < 500
-    record_trials([unfinished], table)  # again: no second row
+    record_trials([unfinished], table, note="stopped")  # again: no second row
     written = list(csv.DictReader(table.open()))
     assert {row["trial"] for row in written} == {str(unfinished), str(run)} and len(written) == 2
     for row in written:
         assert (row["algo"], row["seed"], row["environment_steps"]) == ("crc", "7", "2000")
         assert (row["curve"], row["minutes"]) == ("1000:2 2000:4", "1.5")
+        assert row["note"] == ("stopped" if row["trial"] == str(unfinished) else "")
         assert json.loads(row["settings"])["gamma"] == 0.9
         assert bool(row["final_returns"]) == (row["trial"] == str(run))
     assert set(FIELDS) < set(written[0])
