@@ -35,8 +35,8 @@ esac
 
 PATIENT_TRAINING = """
 import sys, time
-print("training", flush=True)
 try:
+    print("training", flush=True)  # the interruption may follow at once
     time.sleep(60)
 except KeyboardInterrupt:
     time.sleep(0.3)  # writing results
