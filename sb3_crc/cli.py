@@ -81,10 +81,7 @@ def baselines(
     from sb3_crc.experiments.baselines import measure_baselines
 
     measured = measure_baselines(task, episodes=episodes, action_repeat=action_repeat, seed=seed)
-    if output is None:
-        console.print_json(data=measured)
-    else:
-        output.write_text(json.dumps(measured, indent=2) + "\n")
+    _show(measured, output)
 
 
 @app.command()
@@ -115,10 +112,7 @@ def ladder(
         measured = [overfit_one_batch(task, name, policy_kwargs, seed=seed) for name in OBJECTIVES]
     else:
         raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, teach, overfit")
-    if output is None:
-        console.print_json(data=measured)
-    else:
-        output.write_text(json.dumps(measured, indent=2) + "\n")
+    _show(measured, output)
 
 
 @app.command()
@@ -150,3 +144,10 @@ def curve(
     references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
     evaluations = run / "evaluations.npz"
     plot_learning_curve(evaluations, output, action_repeat=action_repeat, title=title, references=references)
+
+
+def _show(measured: object, output: Path | None) -> None:
+    if output is None:
+        console.print_json(data=measured)
+    else:
+        output.write_text(json.dumps(measured, indent=2) + "\n")

@@ -215,7 +215,6 @@ def test_storages_that_are_no_files_are_left_alone(tmp_path: Path, monkeypatch: 
     assert (tmp_path / "deep" / "study.db").exists()
 
 
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
 def test_workers_that_start_together_find_the_tables_of_sqlite(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
     start = context.Barrier(4)

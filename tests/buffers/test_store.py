@@ -131,8 +131,8 @@ def test_a_pickle_holds_the_frames_that_came() -> None:
     assert len(pickle.dumps(buffer.store)) < 20 * 400 + 2_000
 
 
-@pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
-def test_what_was_pickled_beside_a_gpu_is_loaded_where_there_is_none() -> None:
+def test_what_was_pickled_beside_a_gpu_is_loaded_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.cuda, "is_available", lambda: False)
     world = World()
     buffer, twin = world.buffer(9), world.twin(9)
     fill(world.episodes(12), buffer, twin)
