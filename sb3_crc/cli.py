@@ -93,6 +93,7 @@ def ladder(
     task: Annotated[str, typer.Argument(help="domain-task")] = "cartpole-swingup",
     output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
     config: Annotated[Path, typer.Option(help="rl-zoo file whose policy_kwargs are used")] = Path("zoo_configs/laptop.yml"),
+    reward_scale: Annotated[float, typer.Option(help="factor on the rewards, rung state")] = 1.0,
     seed: int = 0,
 ) -> None:
     """Measure what must work before learning from pixels can."""
@@ -103,7 +104,7 @@ def ladder(
 
     policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
     if rung == "state":
-        measured: object = state_sac(task, seed=seed)
+        measured: object = state_sac(task, reward_scale=reward_scale, seed=seed)
     elif rung == "probe":
         measured = probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
     elif rung == "teach":

@@ -18,6 +18,7 @@ from sb3_crc.settings import check_name
 
 #: A batch of images, or a mapping in which there is one
 Observations = th.Tensor | Mapping[str, th.Tensor]
+INITIALIZATIONS = ("delta_orthogonal", "orthogonal")
 LATENT_ACTIVATIONS: dict[str, type[nn.Module]] = {"none": nn.Identity, "tanh": nn.Tanh}
 
 
@@ -36,7 +37,12 @@ class PixelEncoder(BaseFeaturesExtractor):
     :param kernel_size: side of each kernel
     :param latent_activation: ``"none"`` or ``"tanh"``, after the LayerNorm
     :param center_input: feed pixels / 255 - 0.5 instead of pixels / 255
-    :raises ValueError: if the space is not one of images, or these are too small for the convolutions
+    :param frame_differences: feed the newest frame as it is, and instead of each older one how the next differs from it, times
+        this factor: what stands still vanishes, and velocities can be read from single channels; None: the frames as they are
+    :param frame_channels: channels of one frame of the stack, for ``frame_differences``
+    :param initialization: of the convolutions: ``"orthogonal"`` (DrQ), or ``"delta_orthogonal"`` (CURL: only the kernels'
+        middle, so that layers of stride 2 start blind to three pixels of four)
+    :raises ValueError: if the space is not one of images, these are too small for the convolutions, or not a stack of frames
     """
 
     def __init__(
@@ -50,6 +56,9 @@ class PixelEncoder(BaseFeaturesExtractor):
         kernel_size: int = 3,
         latent_activation: str = "none",
         center_input: bool = False,
+        frame_differences: float | None = None,
+        frame_channels: int = 3,
+        initialization: str = "delta_orthogonal",
     ):
         frame_stack, *frame_size = image_shape(image_space(observation_space))
         super().__init__(observation_space, features_dim)
@@ -71,8 +80,16 @@ class PixelEncoder(BaseFeaturesExtractor):
 
         layers: list[nn.Module] = []
         for c_in, c_out, stride in zip((frame_stack, *channels), channels, strides, strict=False):
-            convolution = CenteredConv2d if center_input and not layers else nn.Conv2d
-            layers += [convolution(c_in, c_out, kernel_size, stride), nn.ReLU()]
+            layers += [nn.Conv2d(c_in, c_out, kernel_size, stride), nn.ReLU()]
+        #: What the convolutions are fed instead of each channel, ``(C, C)``; None: the channels as they are
+        self.mixing: th.Tensor | None = None
+        shift = th.full((frame_stack,), 0.5 * center_input)
+        if frame_differences is not None:
+            self.mixing = difference_mixing(frame_stack, frame_channels, frame_differences)
+            shift[:-frame_channels] = 0  # differences are centred as they are
+        if center_input or frame_differences is not None:
+            mixing = th.eye(frame_stack) if self.mixing is None else self.mixing
+            layers[0] = MixedConv2d(mixing, shift, channels[0], kernel_size, strides[0])
         self.convolutions = nn.Sequential(*layers)
         minimum = smallest_input(self.strides, kernel_size)
         if min(height, width) < minimum:
@@ -84,7 +101,11 @@ class PixelEncoder(BaseFeaturesExtractor):
         #: F
         self.convolution_dim: int = output.numel()
         self.projection = latent_projection(self.convolution_dim, features_dim, latent_activation)
+        check_name("initialization", initialization, INITIALIZATIONS)
         self.apply(init_orthogonal)
+        if initialization == "orthogonal":
+            for layer in layers[::2]:
+                nn.init.orthogonal_(layer.weight, nn.init.calculate_gain("relu"))  # type: ignore[arg-type]
         self.convolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # 3x faster on CPU
 
     @property
@@ -110,14 +131,49 @@ class PixelEncoder(BaseFeaturesExtractor):
         return latents
 
 
-class CenteredConv2d(nn.Conv2d):
-    """A convolution of its input minus 1/2, without padding, so that the bias can take the shift: no pass over the pixels."""
+class MixedConv2d(nn.Conv2d):
+    """
+    A convolution of ``mixing @ input - shift``, without padding: its kernels are mixed, not the pixels, and the bias takes the
+    shift, so that neither needs a pass over the images.
+
+    :param mixing: ``(C, C)``, what each channel becomes
+    :param shift: ``(C,)``
+    :param out_channels: as in Conv2d, like what follows
+    """
+
+    mixing: th.Tensor
+    shift: th.Tensor
+
+    def __init__(self, mixing: th.Tensor, shift: th.Tensor, out_channels: int, kernel_size: int, stride: int):
+        super().__init__(len(mixing), out_channels, kernel_size, stride)
+        self.register_buffer("mixing", mixing, persistent=False)
+        self.register_buffer("shift", shift, persistent=False)
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """:param input: ``(B, C, H, W)``; :return: as Conv2d"""
         assert self.bias is not None
-        bias = self.bias - 0.5 * self.weight.sum(dim=(1, 2, 3))
-        return F.conv2d(input, self.weight, bias, self.stride)
+        weight = th.einsum("oihw,ij->ojhw", self.weight, self.mixing)
+        bias = self.bias - self.weight.sum(dim=(2, 3)) @ self.shift
+        return F.conv2d(input, weight.contiguous(memory_format=th.channels_last), bias, self.stride)
+
+
+def difference_mixing(channels: int, frame_channels: int, factor: float) -> th.Tensor:
+    """
+    :param channels: C, of the whole stack, oldest frame first
+    :param frame_channels: of one frame
+    :param factor: of the differences
+    :return: ``(C, C)``, maps a stack to the differences between neighbouring frames and, last, the newest frame
+    :raises ValueError: if there are not at least two whole frames
+    """
+    if channels < 2 * frame_channels or channels % frame_channels:
+        raise ValueError(
+            f"frame_differences needs frames of {frame_channels} channels, at least two: the stack has {channels}"
+        )
+    mixing = th.eye(channels)
+    older = channels - frame_channels
+    mixing[:older, :older] *= -factor
+    mixing[:older, frame_channels:] += factor * th.eye(older)
+    return mixing
 
 
 def latent_projection(in_features: int, latent_dim: int, activation: str) -> nn.Sequential:

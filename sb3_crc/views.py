@@ -9,11 +9,12 @@ anchor     augmented o_t                 yes, with   no             critic; acto
 positive   o_t, augmented anew           no          yes            key of the contrastive loss; s' of the consistency
                                                                     loss
 clean      the middle of o_t             no          yes            target of the consistency loss with its predictor
-                                                                    on the online side (``crc_release``)
-next       augmented o_{t+1}             yes,        yes            objectives that declare ``reads_next``; none of ours
-                                         detached
-bootstrap  augmented o_{t+n}             yes,        yes            next actions (online), Q targets (key encoder)
-                                         detached
+                                                                    on the online side (``crc_release``); what the
+                                                                    reconstruction paints with ``target="clean"``
+next       augmented o_{t+1}             yes,        yes            objectives that declare ``reads_next``: the contrastive
+                                         detached                   loss with ``key="next"``
+bootstrap  augmented o_{t+n}             yes,        yes            next actions (online), Q targets (key encoder); the
+                                         detached                   contrastive loss with ``key="bootstrap"``
 ========== ============================= =========== ============== ===================================================
 
 For every preset: what no consumer asks for is neither augmented nor encoded, so ``rad`` and ``pixel_sac`` make no positive

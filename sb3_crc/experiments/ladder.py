@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -29,7 +30,13 @@ PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
 def state_sac(
-    task: str, *, agent_steps: int = 12_500, evaluations: int = 5, episodes: int = 10, seed: int = 0
+    task: str,
+    *,
+    agent_steps: int = 12_500,
+    evaluations: int = 5,
+    episodes: int = 10,
+    reward_scale: float = 1.0,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """
     Train stock SAC on the task's states, at the repeat that its pixels have.
@@ -38,12 +45,14 @@ def state_sac(
     :param agent_steps: decisions to train for
     :param evaluations: how often it is evaluated, at equal distances
     :param episodes: fresh ones of each evaluation, with the policy's mean
+    :param reward_scale: factor on the rewards that it learns from
     :param seed: of everything; evaluations use seed + 1000
     :return: curve as environment steps, means and standard deviations
     """
     env = make_dmc(task, observation="state", seed=seed)
     fresh = Monitor(make_dmc(task, observation="state", seed=seed + 1000))
-    model = SAC("MlpPolicy", env, seed=seed, device="cpu", **STATE_SAC)  # type: ignore[arg-type]
+    scaled = TransformReward(env, lambda reward: reward_scale * float(reward))
+    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", **STATE_SAC)  # type: ignore[arg-type]
     curve = []
     for evaluation in range(evaluations):
         model.learn(agent_steps // evaluations, reset_num_timesteps=evaluation == 0)
@@ -56,7 +65,13 @@ def state_sac(
                 "min": float(np.min(returns)),
             }
         )
-    return {"task": task, "seed": seed, "settings": STATE_SAC, "episodes": episodes, "curve": curve}
+    return {
+        "task": task,
+        "seed": seed,
+        "settings": {**STATE_SAC, "reward_scale": reward_scale},
+        "episodes": episodes,
+        "curve": curve,
+    }
 
 
 def probe_random_encoder(

@@ -1,7 +1,7 @@
 """What an auxiliary objective is."""
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -18,7 +18,7 @@ class AuxiliaryObjective(nn.Module, ABC):
     Subclass it, implement ``forward``, and name it in ``objectives={"my_package.MyObjective": 0.1}``: optimizer, device,
     train/eval mode, save/load and log key follow. Keyword arguments of a subclass become keys of its settings:
     ``{"my_package.MyObjective": {"weight": 0.1, "margin": 2.0}}``. An objective that reads o_{t+1}, ``views.next``, declares
-    it: ``reads_next = True`` in its class.
+    it: ``reads_next = True`` in its class, or of itself.
 
     :param latent_dim: Z
     :param observation_shape: ``(C, H, W)`` of what the encoder is fed
@@ -26,7 +26,7 @@ class AuxiliaryObjective(nn.Module, ABC):
     """
 
     #: Whether ``forward`` reads ``views.next``, which replay buffers with n-step returns do not all keep
-    reads_next: ClassVar[bool] = False
+    reads_next: bool = False
 
     def __init__(self, latent_dim: int, observation_shape: tuple[int, int, int], action_dim: int):
         super().__init__()

@@ -14,9 +14,10 @@ from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives.base import AuxiliaryObjective
 from sb3_crc.settings import check_name
-from sb3_crc.views import Views
+from sb3_crc.views import View, Views
 
 REDUCTIONS = ("mean", "sum")
+TARGETS = ("anchor", "clean")
 
 
 def reconstruction_loss(decoded: th.Tensor, target: th.Tensor, reduction: str = "mean") -> th.Tensor:
@@ -50,12 +51,18 @@ def quantize(images: th.Tensor, bits: int) -> th.Tensor:
 class Reconstruction(AuxiliaryObjective):
     """
     L_r of CRC-RL: paint the anchor from its own latent, with penalties on the latent and on the decoder's weights (as in
-    regularised autoencoders, arXiv 1903.12436).
+    regularised autoencoders, arXiv 1903.12436). For an encoder that is fed the differences of frames, those are painted.
 
     :param channels: filters of the encoder's convolutions, which the decoder mirrors
     :param strides: their strides
     :param kernel_size: the side of their kernels
+    :param mixing: ``(C, C)``, what the encoder is fed instead of each channel; None: the channels as they are
     :param reduction: see :func:`reconstruction_loss`
+    :param target: name of the view that is painted: ``"anchor"`` (the paper), or ``"clean"``: the same frames without the
+        augmentation, which the latent then need not hold
+    :param half_size: paint at the size of the first convolution's output, for half of the cost
+    :param standardize: paint how the image differs from the batch's mean image, in units of each channel's standard deviation;
+        else, where little moves, the mean image is nearly all that there is to gain
     :param bits: quantise the target to so many bits per channel, dithered by uniform noise, and shift it to [-0.5, 0.5)
         (SAC+AE, after Glow, arXiv 1807.03039); None: the pixels as they are, in [0, 1]
     :param latent_penalty: lambda_s, factor of the mean over the batch of ``||s||^2 / 2``
@@ -72,6 +79,10 @@ class Reconstruction(AuxiliaryObjective):
         strides: Sequence[int] = (2, 1, 1, 1),
         kernel_size: int = 3,
         reduction: str = "mean",
+        target: str = "anchor",
+        half_size: bool = False,
+        standardize: bool = False,
+        mixing: th.Tensor | None = None,
         bits: int | None = None,
         latent_penalty: float = 1e-6,
         decoder_penalty: float = 1e-7,
@@ -80,27 +91,53 @@ class Reconstruction(AuxiliaryObjective):
         if bits is not None and not 1 <= bits <= 8:
             raise ValueError(f"reconstruction: bits={bits} must be from 1 to 8, or None")
         check_name("reconstruction: reduction", reduction, REDUCTIONS)
+        check_name("reconstruction: target", target, TARGETS)
         self.reduction = reduction
+        self.target = target
+        self.standardize = standardize
         self.bits = bits
+        self.register_buffer("mixing", mixing, persistent=False)
         self.latent_penalty = latent_penalty
         self.decoder_penalty = decoder_penalty
-        self.decoder = PixelDecoder(latent_dim, observation_shape, channels=channels, strides=strides, kernel_size=kernel_size)
+        painted, *size = observation_shape
+        if half_size:
+            if len(channels) < 2:
+                raise ValueError(f"reconstruction: half_size needs two convolutions or more, channels={tuple(channels)}")
+            size = [(side - kernel_size) // strides[0] + 1 for side in size]
+            channels, strides = channels[1:], strides[1:]
+        self.size = size[0], size[1]
+        shape = painted, *self.size
+        self.decoder = PixelDecoder(latent_dim, shape, channels=channels, strides=strides, kernel_size=kernel_size)
 
     @classmethod
     def for_encoder(cls, encoder: PixelEncoder, action_dim: int, **own: Any) -> Self:
         """Build it with a decoder that mirrors ``encoder``."""
-        mirrored = {"channels": encoder.channels, "strides": encoder.strides, "kernel_size": encoder.kernel_size}
+        mirrored = {
+            "channels": encoder.channels,
+            "strides": encoder.strides,
+            "kernel_size": encoder.kernel_size,
+            "mixing": encoder.mixing,
+        }
         return super().for_encoder(encoder, action_dim, **{**mirrored, **own})
 
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
         latent = views.anchor.latent
-        anchor = views.anchor
-        target = anchor.pixels if self.bits is None else quantize(anchor.images, self.bits)
-        loss = reconstruction_loss(self.decoder(latent), target, self.reduction)
+        loss = reconstruction_loss(self.decoder(latent), self._painted(getattr(views, self.target)), self.reduction)
         if self.latent_penalty > 0:
             loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
         if self.decoder_penalty > 0:
             squares = [parameter.square().sum() for parameter in self.decoder.parameters()]
             loss = loss + self.decoder_penalty * th.stack(squares).sum() / 2
         return loss
+
+    def _painted(self, view: View) -> th.Tensor:
+        images = view.pixels if self.bits is None else quantize(view.images, self.bits)
+        if images.shape[2:] != self.size:
+            images = F.adaptive_avg_pool2d(images, self.size)
+        if self.mixing is not None:
+            images = F.conv2d(images, self.mixing[:, :, None, None])  # type: ignore[index]
+        if self.standardize:
+            images = images - images.mean(dim=0)
+            images = images / images.square().mean(dim=(0, 2, 3), keepdim=True).sqrt().clamp(min=1e-4)
+        return images
