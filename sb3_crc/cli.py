@@ -99,8 +99,7 @@ def ladder(
     """Measure what must work before learning from pixels can."""
     import yaml
 
-    from sb3_crc.experiments.ladder import overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
-    from sb3_crc.objectives import OBJECTIVES
+    from sb3_crc.experiments.ladder import OVERFITTED, overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
 
     policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
     if rung == "state":
@@ -110,7 +109,7 @@ def ladder(
     elif rung == "teach":
         measured = teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
     elif rung == "overfit":
-        measured = [overfit_one_batch(task, name, policy_kwargs, seed=seed) for name in OBJECTIVES]
+        measured = [overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed) for name, own in OVERFITTED]
     else:
         raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, teach, overfit")
     _show(measured, output)

@@ -68,6 +68,7 @@ class CRCSAC(BaseCRCSAC):
         literal reading of the paper's consistency section; an ablation)
     :param balance: ``"grad_norm"`` divides each objective by a moving average of its gradient norm at the latent before
         weighting; ``"none"`` does not
+    :param auxiliary_interval: updates between two steps of the objectives (SAC+AE's decoder update frequency)
     :param joint_update: one pass through the encoder and one optimizer for the sum of critic loss and objectives: faster, but
         here absolute weights matter, and a critic loss that grows with Q can swamp the objectives
     :param reencode: step the critic first, then encode the anchor anew for objectives and actor (CURL, the released code of
@@ -101,6 +102,7 @@ class CRCSAC(BaseCRCSAC):
         image_size: ImageSize | None = None,
         anchor: str = "augmented",
         balance: str = "none",
+        auxiliary_interval: int = 1,
         joint_update: bool = False,
         reencode: bool = False,
         initial_updates: int = 0,
@@ -138,6 +140,7 @@ class CRCSAC(BaseCRCSAC):
         self.image_size = image_size
         self.anchor = anchor
         self.balance = balance
+        self.auxiliary_interval = auxiliary_interval
         self.joint_update = joint_update
         self.reencode = reencode
         self.initial_updates = initial_updates
@@ -267,14 +270,14 @@ class CRCSAC(BaseCRCSAC):
         critic_loss = self._critic_loss(views)
         td_gradient, *head_gradients = th.autograd.grad(critic_loss, [anchor.latent, *self.critic.head_parameters()])
         metrics = {"train/critic_loss": critic_loss.detach()}
-        optimizer = self.policy.encoder_optimizer
+        optimizer = self.policy.encoder_optimizer if self._n_updates % self.auxiliary_interval == 0 else None
         if optimizer is None or self.reencode:
             self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
+        if self.reencode:
+            anchor.forget_encoding()
         if optimizer is None:
             return metrics
 
-        if self.reencode:
-            anchor.forget_encoding()
         auxiliary = self._auxiliary_gradients(views, td_gradient)
         if self.joint_update:
             total = auxiliary.plus(td_gradient)

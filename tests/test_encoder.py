@@ -61,6 +61,38 @@ def test_initialisation_is_orthogonal_and_delta_orthogonal() -> None:
     assert not linear.bias.any()
 
 
+def test_orthogonal_kernels_are_dense_and_orthogonal() -> None:
+    encoder = PixelEncoder(image_space(9, 48), initialization="orthogonal")
+    kernel = encoder.convolutions[2].weight.flatten(start_dim=1)  # (32, 288)
+    assert th.allclose(kernel @ kernel.T, 2 * th.eye(32), atol=1e-5)  # gain sqrt 2
+    assert kernel.count_nonzero() == kernel.numel()
+    with pytest.raises(ValueError, match=r"initialization 'ortogonal'.*did you mean 'orthogonal'"):
+        PixelEncoder(image_space(9, 48), initialization="ortogonal")
+
+
+@pytest.mark.parametrize("center_input", [False, True])
+def test_the_encoder_is_fed_amplified_differences_and_the_newest_frame(center_input: bool) -> None:
+    mixed = PixelEncoder(image_space(9, 40), frame_differences=4.0, center_input=center_input)
+    plain = PixelEncoder(image_space(9, 40))
+    plain.load_state_dict(mixed.state_dict())
+    images = th.rand(2, 9, 40, 40)
+    oldest, older, newest = images.split(3, dim=1)
+    fed = th.cat([4 * (older - oldest), 4 * (newest - older), newest - 0.5 * center_input], dim=1)
+    assert th.allclose(mixed.convolve(images), plain.convolve(fed), atol=1e-4)
+
+    direction = th.randn(2, mixed.convolution_dim)
+    for encoder, inputs in ((mixed, images), (plain, fed)):  # and learns as if it were
+        (encoder.convolve(inputs) * direction).sum().backward()
+    for mine, theirs in zip(mixed.convolutions.parameters(), plain.convolutions.parameters(), strict=True):
+        assert th.allclose(mine.grad, theirs.grad, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("channels", "frame_channels"), [(3, 3), (9, 2), (4, 4)])
+def test_differences_need_two_whole_frames(channels: int, frame_channels: int) -> None:
+    with pytest.raises(ValueError, match=f"{frame_channels} channels, at least two: the stack has {channels}"):
+        PixelEncoder(image_space(channels, 40), frame_differences=4.0, frame_channels=frame_channels)
+
+
 @pytest.mark.parametrize(("size", "strides"), [(84, (2, 1, 1, 1)), (64, (2, 2, 2, 1)), (41, (2, 2)), (36, (2, 1, 1, 1))])
 def test_the_decoder_mirrors_the_encoder(size: int, strides: tuple[int, ...]) -> None:
     channels = (8, 16, 16, 16)[: len(strides)]

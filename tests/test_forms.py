@@ -86,6 +86,27 @@ def test_reencode_looks_again_after_the_critics_step() -> None:
     assert not th.equal(encoded[2], encoded[3])
 
 
+@pytest.mark.parametrize("reencode", [False, True])
+def test_objectives_can_step_at_every_second_update_only(reencode: bool) -> None:
+    model = make_model(auxiliary_interval=2, reencode=reencode)
+    passes = count_encoder_backwards(model)
+    own = [parameter.detach().clone() for parameter in model.policy.objectives.parameters()]
+
+    def moved() -> bool:
+        return any(not th.equal(a, b) for a, b in zip(own, model.policy.objectives.parameters(), strict=True))
+
+    model.train(gradient_steps=1, batch_size=16)
+    assert len(passes) == 1 and not moved()  # of the critic alone
+    model.train(gradient_steps=1, batch_size=16)
+    assert len(passes) == 3 and moved()
+    assert "representation/contrastive" in model.logger.name_to_value
+
+
+def test_an_interval_of_no_updates_is_refused() -> None:
+    with pytest.raises(ValueError, match="auxiliary_interval=0 must be an integer >= 1"):
+        make_model(auxiliary_interval=0)
+
+
 def test_joint_update_and_reencode_exclude_each_other() -> None:
     with pytest.raises(ValueError, match="joint_update and reencode"):
         make_model(joint_update=True, reencode=True)

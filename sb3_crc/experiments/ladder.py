@@ -25,6 +25,13 @@ from sb3_crc.envs.dmc import make_dmc
 
 #: SB3's SAC from states, with the replay ratio of the laptop class
 STATE_SAC = {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 2, "tau": 0.01}
+#: Settings of the losses that are overfitted: the default, and what else a loss can be asked for
+OVERFITTED: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("contrastive", {}),
+    ("consistency", {}),
+    ("reconstruction", {}),
+    ("reconstruction", {"target": "clean", "half_size": True, "standardize": True}),
+)
 #: Ridge penalties that the probe tries, on standardised inputs
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
@@ -179,6 +186,7 @@ def overfit_one_batch(
     objective: str,
     policy_kwargs: Mapping[str, Any],
     *,
+    objective_kwargs: Mapping[str, Any] | None = None,
     updates: int = 1_000,
     batch_size: int = 128,
     learning_rate: float = 1e-3,
@@ -191,19 +199,21 @@ def overfit_one_batch(
     :param task: as for :func:`~sb3_crc.make_dmc`
     :param objective: its name
     :param policy_kwargs: of :class:`~sb3_crc.CRCSAC`
+    :param objective_kwargs: settings of the objective
     :param updates: how many
     :param batch_size: transitions in the batch
     :param learning_rate: of encoder and objective
     :param image_size: side of the frames in pixels, drawn in the fast quality
     :param seed: of everything
     :return: the loss at the first and at the last update; "pixel_variance" is what a decoder of one mean picture would leave
+        of a reconstruction that is not standardised (of one that is: 1)
     """
     env = make_dmc(task, image_size=image_size, render_quality="fast", seed=seed)
     settings = {"qf_learning_rate": 0.0, "encoder_learning_rate": learning_rate, "learning_starts": 4 * batch_size}
     model = CRCSAC(
         "CnnPolicy",
         env,
-        objectives={objective: 1.0},
+        objectives={objective: {"weight": 1.0, **(objective_kwargs or {})}},
         augmentation="center_crop",
         image_size=image_size,
         batch_size=batch_size,
@@ -223,6 +233,7 @@ def overfit_one_batch(
     pixels = batch.observations.float() / 255
     return {
         "objective": objective,
+        "settings": dict(objective_kwargs or {}),
         "updates": updates,
         "first": losses[0],
         "last": losses[-1],

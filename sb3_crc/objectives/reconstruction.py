@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_crc.decoder import PixelDecoder
-from sb3_crc.encoder import PixelEncoder
+from sb3_crc.encoder import PixelEncoder, scale_pixels
 from sb3_crc.objectives.base import AuxiliaryObjective
 from sb3_crc.settings import check_name
 from sb3_crc.views import View, Views
@@ -60,7 +60,7 @@ class Reconstruction(AuxiliaryObjective):
     :param reduction: see :func:`reconstruction_loss`
     :param target: name of the view that is painted: ``"anchor"`` (the paper), or ``"clean"``: the same frames without the
         augmentation, which the latent then need not hold
-    :param half_size: paint at the size of the first convolution's output, for half of the cost
+    :param half_size: paint only the pixels in the middle of the first convolution's windows, for half of the cost
     :param standardize: paint how the image differs from the batch's mean image, in units of each channel's standard deviation;
         else, where little moves, the mean image is nearly all that there is to gain
     :param bits: quantise the target to so many bits per channel, dithered by uniform noise, and shift it to [-0.5, 0.5)
@@ -100,13 +100,15 @@ class Reconstruction(AuxiliaryObjective):
         self.latent_penalty = latent_penalty
         self.decoder_penalty = decoder_penalty
         painted, *size = observation_shape
+        self.step = strides[0] if half_size else 1
+        self.start = kernel_size // 2 if half_size else 0  # the middles of the first convolution's windows
         if half_size:
             if len(channels) < 2:
                 raise ValueError(f"reconstruction: half_size needs two convolutions or more, channels={tuple(channels)}")
             size = [(side - kernel_size) // strides[0] + 1 for side in size]
             channels, strides = channels[1:], strides[1:]
-        self.size = size[0], size[1]
-        shape = painted, *self.size
+        self.ends = tuple(self.start + self.step * side for side in size)
+        shape = painted, size[0], size[1]
         self.decoder = PixelDecoder(latent_dim, shape, channels=channels, strides=strides, kernel_size=kernel_size)
 
     @classmethod
@@ -131,10 +133,15 @@ class Reconstruction(AuxiliaryObjective):
             loss = loss + self.decoder_penalty * th.stack(squares).sum() / 2
         return loss
 
+    def _thin_out(self, images: th.Tensor) -> th.Tensor:
+        bottom, right = self.ends
+        return images[:, :, self.start : bottom : self.step, self.start : right : self.step]
+
     def _painted(self, view: View) -> th.Tensor:
-        images = view.pixels if self.bits is None else quantize(view.images, self.bits)
-        if images.shape[2:] != self.size:
-            images = F.adaptive_avg_pool2d(images, self.size)
+        if self.bits is not None:
+            images = quantize(self._thin_out(view.images), self.bits)
+        else:
+            images = view.pixels if self.step == 1 else scale_pixels(self._thin_out(view.images))
         if self.mixing is not None:
             images = F.conv2d(images, self.mixing[:, :, None, None])  # type: ignore[index]
         if self.standardize:

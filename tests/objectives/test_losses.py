@@ -1,6 +1,8 @@
 """Each loss against its closed form and against an independent derivation in NumPy."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,6 +95,76 @@ def test_reconstruction_adds_the_papers_penalties() -> None:
     latent = 0.3 * (Anchor.latent**2).sum() / 4 / 2
     weights = 0.01 * sum((parameter**2).sum() for parameter in objective.decoder.parameters()) / 2
     assert objective(Batch).item() == pytest.approx((squared_error + latent + weights).item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("key", ["positive", "next", "bootstrap"])
+def test_the_key_is_the_latent_of_the_view_that_is_named(key: str) -> None:
+    latents = {name: SimpleNamespace(latent=th.randn(6, 16), key_latent=th.randn(6, 16)) for name in ("anchor", key)}
+    objective = Contrastive(16, SHAPE, 2, key=key)
+    expected = info_nce(latents["anchor"].latent, latents[key].key_latent, objective.bilinear)
+    assert th.equal(objective(SimpleNamespace(**latents)), expected)  # no other view is there to be read
+    assert objective.reads_next == (key == "next")
+
+
+def test_a_key_that_is_no_view_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"key 'future'.*positive, next, bootstrap"):
+        Contrastive(16, SHAPE, 2, key="future")
+
+
+def reconstruction_views(images: th.Tensor, latents: th.Tensor) -> SimpleNamespace:
+    """Views whose anchor is painted wrongly on purpose where only the clean view may be read."""
+    return SimpleNamespace(anchor=SimpleNamespace(latent=latents), clean=SimpleNamespace(images=images, pixels=images / 255))
+
+
+def test_a_half_size_standardised_reconstruction_of_the_clean_view_equals_numpy() -> None:
+    encoder = PixelEncoder(image_space(6, 20), channels=(4, 8), strides=(2, 1), features_dim=16, frame_differences=4.0)
+    settings = {"weight": 1.0, "target": "clean", "half_size": True, "standardize": True}
+    objective = build_objectives({"reconstruction": {**settings, "latent_penalty": 0, "decoder_penalty": 0}}, encoder, 2)
+    images, latents = th.randint(0, 256, (5, 6, 20, 20), dtype=th.uint8), th.randn(5, 16)
+    decoded = objective["reconstruction"].decoder(latents).detach().numpy()
+    assert decoded.shape == (5, 6, 9, 9)  # of the first convolution's output
+
+    halved = images.numpy()[:, :, 1:18:2, 1:18:2] / 255  # under the middles of its kernels
+    fed = np.concatenate([4 * (halved[:, 3:] - halved[:, :3]), halved[:, 3:]], axis=1)
+    deviation = fed - fed.mean(axis=0)
+    target = deviation / np.sqrt((deviation**2).mean(axis=(0, 2, 3), keepdims=True))
+    views = reconstruction_views(images, latents)
+    assert objective["reconstruction"](views).item() == pytest.approx(((decoded - target) ** 2).mean(), rel=1e-4)
+
+
+def test_standardised_a_reconstruction_sees_a_small_dot_that_moves() -> None:
+    """All but one pixel is always the same. Compared is what is left of the loss, as a share of what the mean image leaves."""
+    images = th.full((16, 3, 16, 16), 250, dtype=th.uint8)
+    images[th.arange(16), :, th.arange(16), th.arange(16).flip(0)] = 170
+    left = {}
+    for standardize in (False, True):
+        th.manual_seed(0)
+        latents = th.randn(16, 16)
+        objective = Reconstruction(
+            16, (3, 16, 16), 1, channels=(8, 8), strides=(2, 1), target="clean", standardize=standardize
+        )
+        optimizer = th.optim.Adam(objective.parameters(), lr=1e-3)
+        views = reconstruction_views(images, latents)
+        mean_image = th.tensor(1.0) if standardize else (views.clean.pixels - views.clean.pixels.mean(dim=0)).square().mean()
+        for _ in range(300):
+            loss = objective(views)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        left[standardize] = (loss / mean_image).item()
+    assert left[True] < 0.5 < 0.9 < left[False]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"target": "next"}, "target 'next'.*anchor, clean"),
+        ({"half_size": True, "channels": (8,), "strides": (2,)}, "two conv"),
+    ],
+)
+def test_a_reconstruction_that_cannot_be_is_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Reconstruction(16, SHAPE, 2, **settings)
 
 
 def test_settings_reach_the_objective_and_the_decoder_mirrors_the_encoder() -> None:
