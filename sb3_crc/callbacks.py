@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image
 from stable_baselines3.common.utils import FloatSchedule
+from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_crc.augmentations import center_crop
@@ -148,6 +149,10 @@ class AuxiliaryLossCallback(BaseCallback):
         self.logger.record("representation/n_updates", self.learner.n_updates, exclude="tensorboard")
 
 
+#: Frames from which the picture's mean image is taken, where the reconstruction is standardised
+STATISTICS_BATCH = 64
+
+
 class ReconstructionImageCallback(BaseCallback):
     """
     Log frames above what the decoder of a :class:`~sb3_crc.CRCSAC` makes of their latents, as an image in TensorBoard.
@@ -199,22 +204,30 @@ class ReconstructionImageCallback(BaseCallback):
         model = _checked_crcsac(self.model, type(self).__name__)
         assert model.replay_buffer is not None
         state = np.random.get_state()
-        frames = model.replay_buffer.sample(self.n_images).observations
+        count = max(self.n_images, STATISTICS_BATCH) if self._reconstruction.standardize else self.n_images
+        frames = model.replay_buffer.sample(count).observations
         np.random.set_state(state)
         encoder, decoder = model.critic.features_extractor, self._reconstruction.decoder
         modes = encoder.training, decoder.training
         encoder.train(False)
         decoder.train(False)
         images, _ = split_observations(frames, model.observation_space)
-        pixels = scale_pixels(center_crop(images, encoder.input_shape[1:]))
-        with th.no_grad():
-            decoded = decoder(encoder(pixels))  # (B, C, H, W)
+        images = center_crop(images, encoder.input_shape[1:])
+        pixels = scale_pixels(images)
+        with th.no_grad(), th.random.fork_rng():  # quantisation draws noise
+            decoded = decoder(encoder(pixels))  # (B, C, H, W), or about half of H and W
+            if self._reconstruction.standardize:
+                mean, scale = self._reconstruction.center_and_scale(self._reconstruction.painted(images, pixels))
+                decoded = decoded * scale + mean
         encoder.train(modes[0])
         decoder.train(modes[1])
         if self._reconstruction.bits is not None:
             decoded = decoded + 0.5  # a quantised target is centred at zero
         shown = self.frame_channels or (3 if pixels.shape[1] % 3 == 0 else 1)
-        rows = [th.cat(list(images[:, -shown:]), dim=2) for images in (pixels, decoded)]  # each (shown, H, n_images W)
+        decoded = F.interpolate(decoded, pixels.shape[2:])
+        rows = [
+            th.cat(list(images[: self.n_images, -shown:]), dim=2) for images in (pixels, decoded)
+        ]  # (shown, H, n_images W)
         picture = th.cat(rows, dim=1).expand(3, -1, -1)
         return (picture.clamp(0, 1) * 255).round().to(th.uint8).cpu()
 

@@ -28,7 +28,7 @@ from sb3_crc import PixelEncoder
 from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
 from sb3_crc.objectives import AuxiliaryObjective
 from sb3_crc.views import Views
-from tests.conftest import NoiseEnv, make_model
+from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 SIZE = 36  # the smallest that SB3's NatureCNN takes
 TINY = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 16}}
@@ -660,6 +660,37 @@ def test_the_picture_shows_the_newest_frame_and_the_decoders_output(bits: int | 
     picture = callback.picture()
     assert th.equal(picture[:, :34], expected)
     assert (picture[:, 34:] == round(0.4 * 255)).all()
+
+
+@pytest.mark.parametrize("bits", [None, 5])
+def test_a_standardised_decoder_that_knows_nothing_shows_the_mean_image(
+    bits: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {"weight": 1.0, "bits": bits, "half_size": True, "standardize": True}
+    encoder = {**POLICY_KWARGS["features_extractor_kwargs"], "frame_differences": 4.0}
+    model = make_model(
+        objectives={"reconstruction": settings}, policy_kwargs={**POLICY_KWARGS, "features_extractor_kwargs": encoder}
+    )
+    callback = ReconstructionImageCallback(n_images=2)
+    callback.init_callback(model)
+    decoder = model.policy.objectives["reconstruction"].decoder
+    assert decoder(th.zeros(2, decoder.linear.in_features)).shape[2:] == (16, 16)  # of 34
+    monkeypatch.setattr(decoder, "forward", lambda latents: th.zeros(len(latents), 9, 16, 16))
+    seed()
+    before = th.get_rng_state()
+    picture = callback.picture()
+    assert th.equal(th.get_rng_state(), before)
+    assert picture.shape == (3, 68, 68)
+
+    seed()
+    assert model.replay_buffer is not None
+    frames = model.replay_buffer.sample(64).observations  # noise: their mean image is almost grey
+    top = left = (frames.shape[2] - 34) // 2
+    mean = frames[:, 6:, top : top + 34, left : left + 34][:, :, 1:33:2, 1:33:2].float().mean(dim=0)
+    expected = th.nn.functional.interpolate(mean[None], (34, 34))[0]
+    for column in (0, 34):
+        difference = picture[:, 34:, column : column + 34] - expected
+        assert difference.abs().max() < (1 if bits is None else 5)  # 5 bits: levels of 8, dithered, over 64 frames
 
 
 def test_pictures_do_not_change_the_run() -> None:

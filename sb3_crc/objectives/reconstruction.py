@@ -125,7 +125,7 @@ class Reconstruction(AuxiliaryObjective):
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
         latent = views.anchor.latent
-        loss = reconstruction_loss(self.decoder(latent), self._painted(getattr(views, self.target)), self.reduction)
+        loss = reconstruction_loss(self.decoder(latent), self._target(getattr(views, self.target)), self.reduction)
         if self.latent_penalty > 0:
             loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
         if self.decoder_penalty > 0:
@@ -133,18 +133,25 @@ class Reconstruction(AuxiliaryObjective):
             loss = loss + self.decoder_penalty * th.stack(squares).sum() / 2
         return loss
 
-    def _thin_out(self, images: th.Tensor) -> th.Tensor:
-        bottom, right = self.ends
-        return images[:, :, self.start : bottom : self.step, self.start : right : self.step]
+    def painted(self, images: th.Tensor, pixels: th.Tensor) -> th.Tensor:
+        """
+        :param images: uint8 ``(B, C, H, W)``
+        :param pixels: the same in [0, 1]
+        :return: what of them is painted, before it is standardised; its last channels are the newest frame
+        """
+        thinned = images[:, :, self.start : self.ends[0] : self.step, self.start : self.ends[1] : self.step]
+        floats = pixels if self.step == 1 else scale_pixels(thinned)
+        target = floats if self.bits is None else quantize(thinned, self.bits)
+        return target if self.mixing is None else F.conv2d(target, self.mixing[:, :, None, None])  # type: ignore[index]
 
-    def _painted(self, view: View) -> th.Tensor:
-        if self.bits is not None:
-            images = quantize(self._thin_out(view.images), self.bits)
-        else:
-            images = view.pixels if self.step == 1 else scale_pixels(self._thin_out(view.images))
-        if self.mixing is not None:
-            images = F.conv2d(images, self.mixing[:, :, None, None])  # type: ignore[index]
-        if self.standardize:
-            images = images - images.mean(dim=0)
-            images = images / images.square().mean(dim=(0, 2, 3), keepdim=True).sqrt().clamp(min=1e-4)
-        return images
+    def center_and_scale(self, painted: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:param painted: see :meth:`painted`; :return: the batch's mean image, and the standard deviation about it"""
+        mean = painted.mean(dim=0)
+        return mean, (painted - mean).square().mean(dim=(0, 2, 3), keepdim=True).sqrt().clamp(min=1e-4)
+
+    def _target(self, view: View) -> th.Tensor:
+        painted = self.painted(view.images, view.pixels if self.step == 1 else view.images)
+        if not self.standardize:
+            return painted
+        mean, scale = self.center_and_scale(painted)
+        return (painted - mean) / scale

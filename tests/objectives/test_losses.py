@@ -85,7 +85,8 @@ def test_the_bilinear_matrix_starts_positive_and_stays_symmetric() -> None:
 def test_reconstruction_adds_the_papers_penalties() -> None:
     class Anchor:
         latent = th.randn(4, 16)
-        pixels = th.rand(4, *SHAPE)
+        images = th.randint(0, 256, (4, *SHAPE), dtype=th.uint8)
+        pixels = images / 255
 
     class Batch:
         anchor = Anchor
