@@ -217,7 +217,7 @@ class ReconstructionImageCallback(BaseCallback):
         with th.no_grad(), th.random.fork_rng():  # quantisation draws noise
             decoded = decoder(encoder(pixels))  # (B, C, H, W), or about half of H and W
             if self._reconstruction.standardize:
-                mean, scale = self._reconstruction.center_and_scale(self._reconstruction.painted(images, pixels))
+                mean, scale = self._reconstruction.center_and_scale(self._reconstruction.painted(images))
                 decoded = decoded * scale + mean
         encoder.train(modes[0])
         decoder.train(modes[1])

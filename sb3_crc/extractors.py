@@ -43,7 +43,7 @@ class ExtractorEncoder:
         self.features_dim = extractor.features_dim
         mirrored = extractor if isinstance(extractor, PixelEncoder) else None
         self.input_shape = mirrored.input_shape if mirrored else image_shape(observation_space)
-        for name in ("channels", "strides", "kernel_size"):
+        for name in ("channels", "strides", "kernel_size", "mixing"):
             default = inspect.signature(Reconstruction.__init__).parameters[name].default
             setattr(self, name, getattr(mirrored, name) if mirrored else default)
 

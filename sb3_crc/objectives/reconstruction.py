@@ -4,6 +4,7 @@ B batch, C channels, H, W height and width, Z latent.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch as th
@@ -133,15 +134,15 @@ class Reconstruction(AuxiliaryObjective):
             loss = loss + self.decoder_penalty * th.stack(squares).sum() / 2
         return loss
 
-    def painted(self, images: th.Tensor, pixels: th.Tensor) -> th.Tensor:
+    def painted(self, images: th.Tensor, pixels: th.Tensor | None = None) -> th.Tensor:
         """
         :param images: uint8 ``(B, C, H, W)``
-        :param pixels: the same in [0, 1]
+        :param pixels: the same in [0, 1], where they are at hand and would be used
         :return: what of them is painted, before it is standardised; its last channels are the newest frame
         """
         thinned = images[:, :, self.start : self.ends[0] : self.step, self.start : self.ends[1] : self.step]
-        floats = pixels if self.step == 1 else scale_pixels(thinned)
-        target = floats if self.bits is None else quantize(thinned, self.bits)
+        to_floats = scale_pixels if self.bits is None else partial(quantize, bits=self.bits)
+        target = to_floats(thinned) if pixels is None else pixels
         return target if self.mixing is None else F.conv2d(target, self.mixing[:, :, None, None])  # type: ignore[index]
 
     def center_and_scale(self, painted: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -150,7 +151,8 @@ class Reconstruction(AuxiliaryObjective):
         return mean, (painted - mean).square().mean(dim=(0, 2, 3), keepdim=True).sqrt().clamp(min=1e-4)
 
     def _target(self, view: View) -> th.Tensor:
-        painted = self.painted(view.images, view.pixels if self.step == 1 else view.images)
+        as_it_is = self.bits is None and self.step == 1
+        painted = self.painted(view.images, view.pixels if as_it_is else None)
         if not self.standardize:
             return painted
         mean, scale = self.center_and_scale(painted)
