@@ -24,7 +24,7 @@ from sb3_crc.presets import PRESETS
 from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
 from sb3_crc.schedules import LearningRate
 from sb3_crc.settings import check_name, check_ranges
-from sb3_crc.views import Views
+from sb3_crc.views import View, Views
 
 #: Side of the network's input over that of the frame, where crops are cut: 84 of 100 pixels (RAD, CURL, CRC-RL).
 CROP_RATIO = 0.84
@@ -64,6 +64,8 @@ class CRCSAC(BaseCRCSAC):
     :param augmentation_kwargs: its arguments
     :param image_size: side of the network's input in pixels, or (height, width); None: 84 % of the frame for crops,
         the whole frame for other augmentations
+    :param q_augmentations: K: the critic loss is averaged over so many augmentations of o_t (DrQ, arXiv 2004.13649, eq. 3)
+    :param target_augmentations: M: the Q targets are averaged over so many augmentations of o_{t+n} (DrQ, eq. 1)
     :param anchor: ``"augmented"``, or ``"center_crop"``: critic, actor, query, s and decoder see the middle of the frame (the
         literal reading of the paper's consistency section; an ablation)
     :param balance: ``"grad_norm"`` divides each objective by a moving average of its gradient norm at the latent before
@@ -100,6 +102,8 @@ class CRCSAC(BaseCRCSAC):
         augmentation: str = "random_crop",
         augmentation_kwargs: Mapping[str, Any] | None = None,
         image_size: ImageSize | None = None,
+        q_augmentations: int = 1,
+        target_augmentations: int = 1,
         anchor: str = "augmented",
         balance: str = "none",
         auxiliary_interval: int = 1,
@@ -138,6 +142,8 @@ class CRCSAC(BaseCRCSAC):
         self.augmentation = augmentation
         self.augmentation_kwargs = augmentation_kwargs
         self.image_size = image_size
+        self.q_augmentations = q_augmentations
+        self.target_augmentations = target_augmentations
         self.anchor = anchor
         self.balance = balance
         self.auxiliary_interval = auxiliary_interval
@@ -252,6 +258,8 @@ class CRCSAC(BaseCRCSAC):
             gamma=self.gamma,
             reward_scale=self.reward_scale,
             augment_anchor=self.anchor == "augmented",
+            n_anchors=self.q_augmentations,
+            n_bootstraps=self.target_augmentations,
             offers_next=self._reads_next,
         )
 
@@ -266,32 +274,34 @@ class CRCSAC(BaseCRCSAC):
         them at the latent for one pass through the encoder and one Adam; ``reencode`` steps the critic before the objectives
         look.
         """
-        anchor, encoder = views.anchor, list(self.critic.features_extractor.parameters())
+        encoder = list(self.critic.features_extractor.parameters())
+        latents = [anchor.latent for anchor in views.anchors]
         critic_loss = self._critic_loss(views)
-        td_gradient, *head_gradients = th.autograd.grad(critic_loss, [anchor.latent, *self.critic.head_parameters()])
+        gradients = th.autograd.grad(critic_loss, [*latents, *self.critic.head_parameters()])
+        td_gradients, head_gradients = gradients[: len(latents)], gradients[len(latents) :]
         metrics = {"train/critic_loss": critic_loss.detach()}
         optimizer = self.policy.encoder_optimizer if self._n_updates % self.auxiliary_interval == 0 else None
         if optimizer is None or self.reencode:
-            self._step(self.critic.optimizer, [*anchor.backward((td_gradient, None), encoder), *head_gradients])
+            self._step(self.critic.optimizer, [*views.backward(td_gradients, encoder), *head_gradients])
         if self.reencode:
-            anchor.forget_encoding()
+            views.forget_encodings()
         if optimizer is None:
             return metrics
 
-        auxiliary = self._auxiliary_gradients(views, td_gradient)
+        auxiliary = self._auxiliary_gradients(views, td_gradients[0])
         if self.joint_update:
-            total = auxiliary.plus(td_gradient)
-            self._step(self.critic.optimizer, [*anchor.backward(total, encoder), *head_gradients])
+            critic_gradients = views.backward(td_gradients, encoder, auxiliary.leaves)
+            self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
             self._step(optimizer, auxiliary.own)
         else:
             if not self.reencode:
-                critic_gradients = anchor.backward((td_gradient, None), encoder, retain_graph=True)
-            encoder_gradients = anchor.backward(auxiliary.leaves, encoder)
+                critic_gradients = views.backward(td_gradients, encoder, retain_graph=True)
+            encoder_gradients = views.anchor.backward(auxiliary.leaves, encoder)
             if not self.reencode:
                 self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
             self._step(optimizer, [*encoder_gradients, *auxiliary.own])
         if self.reencode:
-            anchor.forget_encoding()
+            views.forget_encodings()
         return metrics | auxiliary.metrics
 
     def _auxiliary_gradients(self, views: Views, td_gradient: th.Tensor) -> AuxiliaryGradients:
@@ -300,15 +310,21 @@ class CRCSAC(BaseCRCSAC):
         return auxiliary_gradients(policy.objectives, weights, views, td_gradient, policy.gradient_norms, balance=balance)
 
     def _critic_loss(self, views: Views) -> th.Tensor:
-        """Twin soft Q loss, 0.5 * sum over the heads of the mean squared Bellman error."""
-        with th.no_grad():
-            next_actions, next_log_prob = self.actor.view_log_prob(views.bootstrap)
-            bootstrap = views.bootstrap
-            next_q_values = self.critic_target.q_values(bootstrap.key_latent, next_actions, bootstrap.proprioception)
-            next_values = next_q_values.min(dim=1, keepdim=True).values - self._temperature() * next_log_prob  # (B, 1)
-            target_q_values = views.rewards + views.discounts * next_values
-        q_values = self.critic.q_values(views.anchor.latent, views.actions, views.anchor.proprioception)  # (B, n_critics)
-        return 0.5 * (q_values - target_q_values).square().mean(dim=0).sum()
+        """Twin soft Q loss, 0.5 * sum over the heads of the mean squared Bellman error, averaged as DrQ does."""
+        next_values = th.stack([self._next_values(bootstrap) for bootstrap in views.bootstraps]).mean(dim=0)  # (B, 1)
+        target_q_values = views.rewards + views.discounts * next_values
+        losses = []
+        for anchor in views.anchors:
+            q_values = self.critic.q_values(anchor.latent, views.actions, anchor.proprioception)  # (B, n_critics)
+            losses.append(0.5 * (q_values - target_q_values).square().mean(dim=0).sum())
+        return th.stack(losses).mean()
+
+    @th.no_grad()
+    def _next_values(self, bootstrap: View) -> th.Tensor:
+        """Soft values by the target heads, ``(B, 1)``."""
+        next_actions, next_log_prob = self.actor.view_log_prob(bootstrap)
+        next_q_values = self.critic_target.q_values(bootstrap.key_latent, next_actions, bootstrap.proprioception)
+        return next_q_values.min(dim=1, keepdim=True).values - self._temperature() * next_log_prob
 
     def _update_actor_and_temperature(self, views: Views) -> dict[str, th.Tensor]:
         """Neither encoder nor Q heads receive gradient from the actor loss."""

@@ -34,6 +34,8 @@ RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "batch_size": _COUNT,
     "policy_delay": _COUNT,
     "auxiliary_interval": _COUNT,
+    "q_augmentations": _COUNT,
+    "target_augmentations": _COUNT,
     "target_update_interval": _COUNT,
     "n_steps": _COUNT,
     "gradient_steps": (lambda value: _is_count(value, -1), "an integer >= -1 (-1: as many as steps were taken)"),

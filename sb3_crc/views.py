@@ -17,6 +17,9 @@ bootstrap  augmented o_{t+n}             yes,        yes            next actions
                                          detached                   contrastive loss with ``key="bootstrap"``
 ========== ============================= =========== ============== ===================================================
 
+Of anchor and bootstrap there may be several, each augmented for itself (DrQ's K and M): the critic averages over all of them,
+the actor and the objectives see the first.
+
 For every preset: what no consumer asks for is neither augmented nor encoded, so ``rad`` and ``pixel_sac`` make no positive
 and only ``crc_release`` a clean view. With ``anchor="center_crop"`` the anchor is the middle of o_t, not augmented. With
 ``reencode=True`` (``crc_release``) the anchor is encoded anew after the critic's step: twice per update, thrice where the
@@ -143,6 +146,8 @@ class Views:
     :param gamma: discount for buffers that return none of their own
     :param reward_scale: factor on the rewards
     :param augment_anchor: False: the anchor is the middle of o_t (the literal reading of CRC-RL's consistency section)
+    :param n_anchors: how many independent augmentations of o_t the critic is fitted on; the first is ``anchor``
+    :param n_bootstraps: how many of o_{t+n} the Q targets are averaged over; the first is ``bootstrap``
     :param offers_next: an objective has declared that it reads ``next``
     """
 
@@ -156,6 +161,8 @@ class Views:
         gamma: float = 0.99,
         reward_scale: float = 1.0,
         augment_anchor: bool = True,
+        n_anchors: int = 1,
+        n_bootstraps: int = 1,
         offers_next: bool = False,
     ):
         self._batch = batch
@@ -164,6 +171,8 @@ class Views:
         self._size = encoder.input_shape[1:]
         self._observation_space = encoder.observation_space
         self._augment_anchor = augment_anchor
+        self._n_anchors = n_anchors
+        self._n_bootstraps = n_bootstraps
         self._offers_next = offers_next
         self.actions = batch.actions  # (B, A)
         self.rewards = batch.rewards * reward_scale  # (B, 1)
@@ -171,10 +180,15 @@ class Views:
         self.discounts = (1 - batch.dones) * discounts  # (B, 1), zero where the episode has terminated
 
     @cached_property
-    def anchor(self) -> View:
-        """Augmented o_t, the one view whose online encoding carries gradients."""
+    def anchors(self) -> list[View]:
+        """Augmentations of o_t, the views whose online encodings carry gradients."""
         augment = self._augment if self._augment_anchor else self._middle
-        return self._view(self._batch.observations, augment, trains_encoder=True)
+        return [self._view(self._batch.observations, augment, trains_encoder=True) for _ in range(self._n_anchors)]
+
+    @property
+    def anchor(self) -> View:
+        """Augmented o_t, the one of ``anchors`` that the actor and the objectives see."""
+        return self.anchors[0]
 
     @cached_property
     def positive(self) -> View:
@@ -197,9 +211,44 @@ class Views:
         return self._view(observations, self._augment)
 
     @cached_property
+    def bootstraps(self) -> list[View]:
+        """Augmentations of o_{t+n}, from which the return is bootstrapped."""
+        return [self._view(self._batch.next_observations, self._augment) for _ in range(self._n_bootstraps)]
+
+    @property
     def bootstrap(self) -> View:
-        """Augmented o_{t+n}, from which the return is bootstrapped."""
-        return self._view(self._batch.next_observations, self._augment)
+        """Augmented o_{t+n}, the one of ``bootstraps`` that objectives may read."""
+        return self.bootstraps[0]
+
+    def backward(
+        self,
+        td_gradients: Sequence[th.Tensor],
+        parameters: Sequence[th.Tensor],
+        leaves: tuple[th.Tensor | None, th.Tensor | None] = (None, None),
+        *,
+        retain_graph: bool = False,
+    ) -> list[th.Tensor | None]:
+        """
+        Carry the critic's gradients on into the encoder.
+
+        :param td_gradients: at the latent of each of ``anchors``
+        :param parameters: of the online encoder
+        :param leaves: of another loss at the leaves of ``anchor``, to carry on in the same pass
+        :param retain_graph: keep the graph of ``anchor``'s encoding for another call
+        :return: the gradient for each parameter, summed over the anchors
+        """
+        latent, features = leaves
+        first = td_gradients[0] if latent is None else td_gradients[0] + latent
+        total = list(self.anchor.backward((first, features), parameters, retain_graph=retain_graph))
+        for anchor, td_gradient in zip(self.anchors[1:], td_gradients[1:], strict=True):
+            for index, gradient in enumerate(anchor.backward((td_gradient, None), parameters)):
+                total[index] = gradient if total[index] is None else total[index] + gradient
+        return total
+
+    def forget_encodings(self) -> None:
+        """Encode the anchors anew when they are read next, by the weights of then."""
+        for anchor in self.anchors:
+            anchor.forget_encoding()
 
     def _view(self, observations: Any, augment: Callable[[Images], th.Tensor], *, trains_encoder: bool = False) -> View:
         images, proprioception = split_observations(observations, self._observation_space)
