@@ -275,8 +275,8 @@ class CRCSAC(BaseCRCSAC):
         look.
         """
         encoder = list(self.critic.features_extractor.parameters())
-        latents = [anchor.latent for anchor in views.anchors]
         critic_loss = self._critic_loss(views)
+        latents = [anchor.latent for anchor in views.anchors]
         gradients = th.autograd.grad(critic_loss, [*latents, *self.critic.head_parameters()])
         td_gradients, head_gradients = gradients[: len(latents)], gradients[len(latents) :]
         metrics = {"train/critic_loss": critic_loss.detach()}

@@ -30,7 +30,7 @@ output, Z latent, P proprioception, A action. With ``n_steps=1``, next and boots
 """
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import torch as th
@@ -239,11 +239,11 @@ class Views:
         """
         latent, features = leaves
         first = td_gradients[0] if latent is None else td_gradients[0] + latent
-        total = list(self.anchor.backward((first, features), parameters, retain_graph=retain_graph))
+        passes = [self.anchor.backward((first, features), parameters, retain_graph=retain_graph)]
         for anchor, td_gradient in zip(self.anchors[1:], td_gradients[1:], strict=True):
-            for index, gradient in enumerate(anchor.backward((td_gradient, None), parameters)):
-                total[index] = gradient if total[index] is None else total[index] + gradient
-        return total
+            passes.append(anchor.backward((td_gradient, None), parameters))
+        by_parameter = (list(filter(th.is_tensor, gradients)) for gradients in zip(*passes, strict=True))
+        return [reduce(th.add, gradients) if gradients else None for gradients in by_parameter]
 
     def forget_encodings(self) -> None:
         """Encode the anchors anew when they are read next, by the weights of then."""
