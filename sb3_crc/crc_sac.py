@@ -274,9 +274,9 @@ class CRCSAC(BaseCRCSAC):
         them at the latent for one pass through the encoder and one Adam; ``reencode`` steps the critic before the objectives
         look.
         """
-        encoder = list(self.critic.features_extractor.parameters())
+        anchors, encoder = views.anchors, list(self.critic.features_extractor.parameters())
         critic_loss = self._critic_loss(views)
-        latents = [anchor.latent for anchor in views.anchors]
+        latents = [anchor.latent for anchor in anchors]
         gradients = th.autograd.grad(critic_loss, [*latents, *self.critic.head_parameters()])
         td_gradients, head_gradients = gradients[: len(latents)], gradients[len(latents) :]
         metrics = {"train/critic_loss": critic_loss.detach()}
