@@ -88,30 +88,45 @@ def baselines(
 def ladder(
     rung: Annotated[
         str,
-        typer.Argument(help="state: SAC from states; probe: an untrained encoder; teach: a taught one; overfit: each loss"),
+        typer.Argument(
+            help="state: SAC from states; seen: SAC from positions as an encoder could see them; probe: an untrained encoder; "
+            "teach: a taught one; overfit: each loss"
+        ),
     ],
     task: Annotated[str, typer.Argument(help="domain-task")] = "cartpole-swingup",
     output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
     config: Annotated[Path, typer.Option(help="rl-zoo file whose policy_kwargs are used")] = Path("zoo_configs/laptop.yml"),
     reward_scale: Annotated[float, typer.Option(help="factor on the rewards, rung state")] = 1.0,
+    error: Annotated[list[float] | None, typer.Option(help="of what is read off a frame, in metres, rung seen")] = None,
+    n_steps: Annotated[list[int] | None, typer.Option(help="of the returns, rung seen")] = None,
+    target_entropy: Annotated[float, typer.Option(help="of the policy, rung seen")] = -1.0,
     seed: int = 0,
 ) -> None:
     """Measure what must work before learning from pixels can."""
     import yaml
 
-    from sb3_crc.experiments.ladder import OVERFITTED, overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
+    from sb3_crc.experiments import ladder as rungs
 
     policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
     if rung == "state":
-        measured: object = state_sac(task, reward_scale=reward_scale, seed=seed)
+        measured: object = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
+    elif rung == "seen":
+        measured = [
+            rungs.seen_state_sac(task, error=one, n_steps=steps, target_entropy=target_entropy, seed=seed)
+            for one in error or [0.0]
+            for steps in n_steps or [1]
+        ]
     elif rung == "probe":
-        measured = probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+        measured = rungs.probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
     elif rung == "teach":
-        measured = teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+        measured = rungs.teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
     elif rung == "overfit":
-        measured = [overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed) for name, own in OVERFITTED]
+        measured = [
+            rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed)
+            for name, own in rungs.OVERFITTED
+        ]
     else:
-        raise typer.BadParameter(f"{rung!r} is no rung; there are state, probe, teach, overfit")
+        raise typer.BadParameter(f"{rung!r} is none of state, seen, probe, teach, overfit")
     _show(measured, output)
 
 

@@ -1,7 +1,8 @@
 """The ladder under learning from pixels: what must work before the next rung is worth a try.
 
-State SAC shows that the environment can be learned at all, the probe what a latent knows before it has learned anything,
-teaching what the encoder can see, and overfitting that each loss can be minimised. The rungs above are runs of ``train.py``.
+State SAC shows that the environment can be learned at all, SAC from positions with an error how well an encoder has to see,
+the probe what a latent knows before it has learned anything, teaching what the encoder can see, and overfitting that each loss
+can be minimised. The rungs above are runs of ``train.py``.
 
 N frames, B batch, Z latent, S state.
 """
@@ -9,6 +10,7 @@ N frames, B batch, Z latent, S state.
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -16,12 +18,14 @@ from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from torch import nn
 
 from sb3_crc.augmentations import random_shift
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.envs.dmc import make_dmc
+from sb3_crc.experiments.seen_positions import SeenPositions
 
 #: SB3's SAC from states, with the replay ratio of the laptop class
 STATE_SAC = {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 2, "tau": 0.01}
@@ -56,29 +60,65 @@ def state_sac(
     :param seed: of everything; evaluations use seed + 1000
     :return: curve as environment steps, means and standard deviations
     """
-    env = make_dmc(task, observation="state", seed=seed)
-    fresh = Monitor(make_dmc(task, observation="state", seed=seed + 1000))
+    env, fresh = (make_dmc(task, observation="state", seed=seed + offset) for offset in (0, 1000))
     scaled = TransformReward(env, lambda reward: reward_scale * float(reward))
     model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", **STATE_SAC)  # type: ignore[arg-type]
+    curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, env.action_repeat)
+    settings = {**STATE_SAC, "reward_scale": reward_scale}
+    return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
+
+
+def seen_state_sac(
+    task: str,
+    *,
+    error: float,
+    n_steps: int = 1,
+    target_entropy: float = -1.0,
+    agent_steps: int = 7_500,
+    evaluations: int = 6,
+    episodes: int = 10,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """
+    Train stock SAC on what an encoder of cartpole's pictures could deliver, with the laptop class's heads and rewards.
+
+    :param task: of cartpole
+    :param error: of what is read off a frame, in metres: :class:`~sb3_crc.experiments.seen_positions.SeenPositions`
+    :param n_steps: of the return
+    :param target_entropy: of the policy
+    :param agent_steps: decisions to train for
+    :param evaluations: how often it is evaluated, at equal distances
+    :param episodes: fresh ones of each evaluation, with the policy's mean
+    :param seed: of everything; evaluations use seed + 1000
+    :return: curve as environment steps, means and standard deviations
+    """
+    states = [make_dmc(task, observation="state", seed=seed + offset) for offset in (0, 1000)]
+    env, fresh = (SeenPositions(state, error=error, seed=seed) for state in states)
+    settings = {**STATE_SAC, "ent_coef": "auto_0.1", "n_steps": n_steps, "target_entropy": target_entropy, "batch_size": 128}
+    heads = {"net_arch": [256, 256], "activation_fn": lambda: nn.Sequential(nn.LayerNorm(256), nn.ReLU())}
+    scaled = TransformReward(env, lambda reward: 0.1 * float(reward))
+    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **settings)  # type: ignore[arg-type]
+    curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
+    settings |= {"reward_scale": 0.1, "error": error}
+    return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
+
+
+def _learning_curve(
+    model: SAC, fresh: gym.Env[Any, Any], agent_steps: int, evaluations: int, episodes: int, action_repeat: int
+) -> list[dict[str, float]]:
     curve = []
     for evaluation in range(evaluations):
         model.learn(agent_steps // evaluations, reset_num_timesteps=evaluation == 0)
         returns, _ = evaluate_policy(model, fresh, n_eval_episodes=episodes, return_episode_rewards=True)
         curve.append(
             {
-                "environment_steps": model.num_timesteps * env.action_repeat,
+                "environment_steps": model.num_timesteps * action_repeat,
                 "mean": float(np.mean(returns)),
                 "std": float(np.std(returns, ddof=1)),
                 "min": float(np.min(returns)),
             }
         )
-    return {
-        "task": task,
-        "seed": seed,
-        "settings": {**STATE_SAC, "reward_scale": reward_scale},
-        "episodes": episodes,
-        "curve": curve,
-    }
+    return curve
 
 
 def probe_random_encoder(
@@ -139,7 +179,7 @@ def teach_encoder(
     th.manual_seed(seed)
     rng = np.random.default_rng(seed)
     encoder = PixelEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **encoder_kwargs)
-    head = th.nn.Linear(encoder.features_dim, targets.shape[1])
+    head = nn.Linear(encoder.features_dim, targets.shape[1])
     optimizer = th.optim.Adam([*encoder.parameters(), *head.parameters()], lr=learning_rate)
     for _ in range(updates):
         rows = th.from_numpy(rng.integers(0, split, batch_size))
