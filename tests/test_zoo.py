@@ -120,6 +120,25 @@ def test_yaml_env_kwargs_reach_the_evaluation_environment(tmp_path: Path) -> Non
         model.env.close()
 
 
+def test_a_configuration_may_hold_what_one_preset_has_beside_the_others(tmp_path: Path) -> None:
+    shared = {"n_timesteps": 10, "policy": "CnnPolicy", "batch_size": 8, "tau": 0.1, "gamma": 0.9}
+    config = tmp_path / "config.yml"
+    config.write_text(yaml.safe_dump({ENV: {**shared, "presets": {"crc": {"batch_size": 16, "tau": 0.2}}}}))
+
+    def read(algo: str, **given: float) -> dict[str, Any]:
+        args = (Namespace(), algo, ENV, str(tmp_path))
+        consumed, saved = CRCExperimentManager(*args, config=str(config), hyperparams=given, verbose=0).read_hyperparameters()
+        assert consumed == saved
+        return saved
+
+    assert read("rad") == shared
+    assert read("crc") == {**shared, "batch_size": 16, "tau": 0.2}
+    assert read("crc", tau=0.3) == {**shared, "batch_size": 16, "tau": 0.3}  # -params wins
+    config.write_text(yaml.safe_dump({ENV: {**shared, "presets": {"carl": {}}}}))
+    with pytest.raises(ValueError, match="unknown preset 'carl'; did you mean 'curl'"):
+        read("rad")
+
+
 def test_a_callback_that_cannot_work_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     config = {"n_timesteps": 10, "policy": "CnnPolicy", "callback": [{"rl_zoo3.callbacks.ParallelTrainCallback": {}}]}
     (tmp_path / "config.yml").write_text(yaml.safe_dump({ENV: config}))

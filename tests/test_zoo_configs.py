@@ -23,9 +23,10 @@ HARDER_TASKS = PAPER_TASKS[6:]
 ZOO_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
 
 CASES = [
-    pytest.param(path, env_id, settings, id=f"{path.stem}-{env_id}")
+    pytest.param(path, env_id, {**settings, **own}, id=f"{path.stem}-{env_id}{preset and '-'}{preset}")
     for path in sorted(CONFIGS.glob("*.yml"))
     for env_id, settings in yaml.safe_load(path.read_text()).items()
+    for preset, own in {"": {}, **settings.pop("presets", {})}.items()
 ]
 
 

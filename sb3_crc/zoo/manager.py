@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_crc.analysis.films import film
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.presets import PRESETS
+from sb3_crc.settings import check_name
 from sb3_crc.zoo.messages import say
 from sb3_crc.zoo.search import ARGUMENTS, constructor_arguments, sample
 
@@ -51,12 +52,19 @@ class CRCExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
-        As in the zoo; the trial of ``--trial-id`` (which may be 0) replaces what it drew and nothing else.
+        As in the zoo, but a configuration may hold ``presets: {crc: {...}, ...}``: what one preset has beside the rest; and
+        the trial of ``--trial-id`` (which may be 0) replaces what it drew and nothing else.
 
         :return: two mappings of the same content: one to be consumed, one to be saved
+        :raises ValueError: for an unknown preset
         """
         trial_id, self.trial_id = self.trial_id, None
         consumed, saved = super().read_hyperparameters()
+        for hyperparams in (consumed, saved):
+            own = hyperparams.pop("presets", {})
+            for name in own:
+                check_name("preset", name, PRESETS)
+            hyperparams.update({**own.get(self.algo, {}), **(self.custom_hyperparams or {})})
         if trial_id is not None and self.storage and self.study_name and self.algo in PRESETS:
             parameters = self.load_trial(self.storage, self.study_name, trial_id, convert=False)
             drawn = constructor_arguments({**PRESETS[self.algo], **saved}, parameters)
