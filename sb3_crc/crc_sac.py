@@ -64,8 +64,8 @@ class CRCSAC(BaseCRCSAC):
     :param augmentation_kwargs: its arguments
     :param image_size: side of the network's input in pixels, or (height, width); None: 84 % of the frame for crops,
         the whole frame for other augmentations
-    :param q_augmentations: K: the critic loss is averaged over so many augmentations of o_t (DrQ, arXiv 2004.13649, eq. 3)
-    :param target_augmentations: M: the Q targets are averaged over so many augmentations of o_{t+n} (DrQ, eq. 1)
+    :param q_augmentations: M: the critic loss is averaged over so many augmentations of o_t (DrQ, arXiv 2004.13649, eq. 3)
+    :param target_augmentations: K: the Q targets are averaged over so many augmentations of o_{t+n} (DrQ, eq. 1)
     :param anchor: ``"augmented"``, or ``"center_crop"``: critic, actor, query, s and decoder see the middle of the frame (the
         literal reading of the paper's consistency section; an ablation)
     :param balance: ``"grad_norm"`` divides each objective by a moving average of its gradient norm at the latent before

@@ -32,10 +32,6 @@ class AuxiliaryGradients:
     own: list[Gradient]
     metrics: dict[str, th.Tensor]
 
-    def plus(self, latent_gradient: th.Tensor) -> tuple[Gradient, Gradient]:
-        """:return: ``leaves`` with another loss's gradient at the latent added"""
-        return _add(self.leaves[0], latent_gradient, 1), self.leaves[1]
-
 
 def auxiliary_gradients(
     objectives: nn.ModuleDict,

@@ -17,7 +17,7 @@ bootstrap  augmented o_{t+n}             yes,        yes            next actions
                                          detached                   contrastive loss with ``key="bootstrap"``
 ========== ============================= =========== ============== ===================================================
 
-Of anchor and bootstrap there may be several, each augmented for itself (DrQ's K and M): the critic averages over all of them,
+Of anchor and bootstrap there may be several, each augmented for itself (DrQ's M and K): the critic averages over all of them,
 the actor and the objectives see the first.
 
 For every preset: what no consumer asks for is neither augmented nor encoded, so ``rad`` and ``pixel_sac`` make no positive

@@ -10,7 +10,7 @@ from sb3_crc import CRCSAC
 from sb3_crc.views import Views
 from tests.conftest import make_model
 
-K, M = 2, 3
+M, K = 2, 3
 
 
 def drq_loss(model: CRCSAC, views: Views) -> th.Tensor:
@@ -23,17 +23,17 @@ def drq_loss(model: CRCSAC, views: Views) -> th.Tensor:
             actions, log_prob = model.actor.action_log_prob(bootstrap.images)
             q_values = model.critic_target.q_values(key_encoder(bootstrap.images), actions, None)
             values.append(q_values.amin(dim=1, keepdim=True) - alpha * log_prob.view(-1, 1))
-        targets = views.rewards + views.discounts * sum(values) / M
+        targets = views.rewards + views.discounts * sum(values) / K
     errors = []
     for anchor in views.anchors:
         q_values = model.critic.q_values(encoder(anchor.images), views.actions, None)
         errors += [0.5 * F.mse_loss(q_values[:, [head]], targets) for head in range(q_values.shape[1])]
-    return sum(errors) / K
+    return sum(errors) / M
 
 
 @pytest.mark.parametrize("form", [{"objectives": {}}, {}, {"joint_update": True}, {"reencode": True}], ids=str)
 def test_the_critics_gradient_is_that_of_drqs_average(form: dict[str, Any]) -> None:
-    model = make_model(q_augmentations=K, target_augmentations=M, **form)
+    model = make_model(q_augmentations=M, target_augmentations=K, **form)
     views = model._sample_views(16)
     images = [view.images for view in (*views.anchors, *views.bootstraps)]
     assert len(images) == K + M
