@@ -7,7 +7,9 @@ from collections.abc import Sequence
 
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
+from sb3_crc.convolutions import Deconvolution
 from sb3_crc.encoder import init_orthogonal
 
 
@@ -33,30 +35,25 @@ class PixelDecoder(nn.Module):
     ):
         super().__init__()
         frame_stack, *size = observation_shape
-        sizes = [tuple(size)]  # of the encoder's input and of each of its convolutions' output
+        sizes = [(size[0], size[1])]  # of the encoder's input and of each of its convolutions' output
         for stride in strides:
-            sizes.append(tuple((side - kernel_size) // stride + 1 for side in sizes[-1]))
+            height, width = ((side - kernel_size) // stride + 1 for side in sizes[-1])
+            sizes.append((height, width))
         self.start_shape = (channels[-1], *sizes[-1])
         self.linear = nn.Linear(latent_dim, channels[-1] * sizes[-1][0] * sizes[-1][1])
 
         layers: list[nn.Module] = []
         outputs = (frame_stack, *channels)
         for depth in reversed(range(len(channels))):
-            layers += [nn.ReLU(), _mirrored(channels[depth], outputs[depth], kernel_size, strides[depth], sizes[depth])]
+            widths = channels[depth], outputs[depth]
+            layers.append(Deconvolution(*widths, kernel_size, strides[depth], size=sizes[depth], relu=depth > 0))
         self.deconvolutions = nn.Sequential(*layers)
         self.apply(init_orthogonal)
         self.deconvolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, latents: th.Tensor) -> th.Tensor:
         """:param latents: ``(B, Z)``; :return: images ``(B, C, H, W)``, unbounded floats meant to match pixels / 255"""
-        start = self.linear(latents).unflatten(1, self.start_shape)
-        images: th.Tensor = self.deconvolutions(start.contiguous(memory_format=th.channels_last))
+        channels, *size = self.start_shape
+        start = F.relu(self.linear(latents)).view(-1, *size, channels)
+        images: th.Tensor = self.deconvolutions(start.permute(0, 3, 1, 2))
         return images
-
-
-def _mirrored(c_in: int, c_out: int, kernel_size: int, stride: int, size: tuple[int, ...]) -> nn.Module:
-    """The layer that undoes the shape of a convolution of an image of ``size``."""
-    if stride == 1:  # the same map as a transposed convolution (kernels flipped), but on oneDNN's fast path
-        return nn.Conv2d(c_in, c_out, kernel_size, padding=kernel_size - 1)
-    output_padding = tuple((side - kernel_size) % stride for side in size)
-    return nn.ConvTranspose2d(c_in, c_out, kernel_size, stride, output_padding=output_padding)  # type: ignore[arg-type]

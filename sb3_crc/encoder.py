@@ -10,9 +10,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
-from torch.nn import functional as F
 
 from sb3_crc.augmentations import ImageSize, center_crop
+from sb3_crc.convolutions import ConvReLU, conv_relu
 from sb3_crc.image_spaces import image_shape, image_space, split_observations
 from sb3_crc.settings import check_name
 
@@ -80,7 +80,7 @@ class PixelEncoder(BaseFeaturesExtractor):
 
         layers: list[nn.Module] = []
         for c_in, c_out, stride in zip((frame_stack, *channels), channels, strides, strict=False):
-            layers += [nn.Conv2d(c_in, c_out, kernel_size, stride), nn.ReLU()]
+            layers.append(ConvReLU(c_in, c_out, kernel_size, stride))
         #: What the convolutions are fed instead of each channel, ``(C, C)``; None: the channels as they are
         self.mixing: th.Tensor | None = None
         shift = th.full((frame_stack,), 0.5 * center_input)
@@ -89,14 +89,14 @@ class PixelEncoder(BaseFeaturesExtractor):
             shift[:-frame_channels] = 0  # differences are centred as they are
         if center_input or frame_differences is not None:
             mixing = th.eye(frame_stack) if self.mixing is None else self.mixing
-            layers[0] = MixedConv2d(mixing, shift, channels[0], kernel_size, strides[0])
+            layers[0] = MixedConvReLU(mixing, shift, channels[0], kernel_size, strides[0])
         self.convolutions = nn.Sequential(*layers)
         minimum = smallest_input(self.strides, kernel_size)
         if min(height, width) < minimum:
             raise ValueError(f"images of {height}x{width} pixels are too small for this encoder: it needs {minimum}x{minimum}")
         with th.no_grad():
             output = self.convolutions(th.zeros(1, *self.input_shape))
-        #: Shape of the last convolution's output, ``(channels, height, width)``
+        #: Shape of the last convolution's output, ``(channels, height, width)``; flattened, the channels come last
         self.convolution_shape = tuple(output.shape[1:])
         #: F
         self.convolution_dim: int = output.numel()
@@ -104,7 +104,7 @@ class PixelEncoder(BaseFeaturesExtractor):
         check_name("initialization", initialization, INITIALIZATIONS)
         self.apply(init_orthogonal)
         if initialization == "orthogonal":
-            for layer in layers[::2]:
+            for layer in layers:
                 nn.init.orthogonal_(layer.weight, nn.init.calculate_gain("relu"))  # type: ignore[arg-type]
         self.convolutions.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # 3x faster on CPU
 
@@ -122,8 +122,8 @@ class PixelEncoder(BaseFeaturesExtractor):
         images, _ = split_observations(observations, self.observation_space)
         images = center_crop(images, self.input_shape[1:])
         pixels = scale_pixels(images) if images.dtype == th.uint8 else images.contiguous(memory_format=th.channels_last)
-        features: th.Tensor = self.convolutions(pixels).flatten(start_dim=1)
-        return features
+        features: th.Tensor = self.convolutions(pixels)
+        return features.permute(0, 2, 3, 1).flatten(start_dim=1)  # as they lie in memory
 
     def project(self, features: th.Tensor) -> th.Tensor:
         """:param features: convolution output ``(B, F)``; :return: latents ``(B, Z)``"""
@@ -131,9 +131,9 @@ class PixelEncoder(BaseFeaturesExtractor):
         return latents
 
 
-class MixedConv2d(nn.Conv2d):
+class MixedConvReLU(ConvReLU):
     """
-    A convolution of ``mixing @ input - shift``, without padding: its kernels are mixed, not the pixels, and the bias takes the
+    A convolution of ``mixing @ input - shift``, and its ReLU: its kernels are mixed, not the pixels, and the bias takes the
     shift, so that neither needs a pass over the images.
 
     :param mixing: ``(C, C)``, what each channel becomes
@@ -150,11 +150,12 @@ class MixedConv2d(nn.Conv2d):
         self.register_buffer("shift", shift, persistent=False)
 
     def forward(self, input: th.Tensor) -> th.Tensor:
-        """:param input: ``(B, C, H, W)``; :return: as Conv2d"""
+        """:param input: ``(B, C, H, W)``; :return: as ConvReLU"""
         assert self.bias is not None
         weight = th.einsum("oihw,ij->ojhw", self.weight, self.mixing)
         bias = self.bias - self.weight.sum(dim=(2, 3)) @ self.shift
-        return F.conv2d(input, weight.contiguous(memory_format=th.channels_last), bias, self.stride)
+        stride = self.stride[0], self.stride[1]
+        return conv_relu(input, weight.contiguous(memory_format=th.channels_last), bias, stride)
 
 
 def difference_mixing(channels: int, frame_channels: int, factor: float) -> th.Tensor:

@@ -281,7 +281,7 @@ def test_our_encoder_in_a_stock_algorithm_is_mirrored_and_may_be_cropped_to() ->
     model.learn(16, callback=callback)
     assert callback.learner is not None
     decoder = callback.learner.objectives["reconstruction"].decoder
-    assert decoder.start_shape[0] == 6 and len(decoder.deconvolutions) == 4
+    assert decoder.start_shape[0] == 6 and len(decoder.deconvolutions) == 2
     assert moved(before, live_extractor(model)) == set(before)
 
 
@@ -293,7 +293,7 @@ def test_objectives_settings_and_a_users_class() -> None:
     model.learn(16, callback=callback)
     assert callback.learner is not None
     assert set(callback.learner.objectives) == {"ActionNorm", "reconstruction"}
-    assert len(callback.learner.objectives["reconstruction"].decoder.deconvolutions) == 2
+    assert len(callback.learner.objectives["reconstruction"].decoder.deconvolutions) == 1
     logged = model.logger.name_to_value
     assert logged["representation/loss"] == pytest.approx(
         0.5 * logged["representation/ActionNorm"] + 0.1 * logged["representation/reconstruction"], rel=1e-5
