@@ -3,6 +3,7 @@
 import io
 import pathlib
 from collections.abc import Iterable
+from contextlib import nullcontext
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -20,6 +21,7 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
 from sb3_crc.instruments import Speedometer
+from sb3_crc.memory import memory_kept
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
 from sb3_crc.saved_model import check_saved_model
 from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
@@ -138,8 +140,12 @@ class BaseCRCSAC(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        """
+        As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps. On a CPU the process keeps
+        freed memory until the end (:func:`~sb3_crc.memory.memory_kept`).
+        """
+        with memory_kept() if self.device.type == "cpu" else nullcontext():
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(
         self,

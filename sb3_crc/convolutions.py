@@ -111,7 +111,10 @@ class _ConvTranspose(th.autograd.Function):
     def forward(
         ctx: Any, images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: Pair, size: Pair, relu: bool
     ) -> th.Tensor:
-        painted = images.new_empty((len(images), weight.shape[1], *size)).to(memory_format=th.channels_last)
+        shape = len(images), weight.shape[1], *size
+        painted = th.empty(
+            shape, dtype=images.dtype, device=images.device, memory_format=th.channels_last
+        )  # only its shape counts
         output, _, _ = _convolution_backward(images, painted, weight, stride, [True, False, False])
         output += bias[:, None, None]
         if relu:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from torch.nn import functional as F
 
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives import (
@@ -55,6 +56,13 @@ def test_reconstruction_loss_equals_numpy() -> None:
     summed = reconstruction_loss(th.tensor(decoded), th.tensor(target), reduction="sum")
     assert summed.item() == pytest.approx(expected * 3 * 5 * 6)
     assert reconstruction_loss(th.full((2, 3, 4, 4), 0.25), th.full((2, 3, 4, 4), 0.75)).item() == pytest.approx(0.25)
+
+
+def test_reconstruction_loss_has_the_gradient_of_mse_loss() -> None:
+    decoded, target = (th.randn(4, 3, 5, 6, dtype=th.float64, requires_grad=True) for _ in range(2))
+    for reduction, factor in (("mean", 1), ("sum", 3 * 5 * 6)):
+        ours = th.autograd.grad(reconstruction_loss(decoded, target, reduction), [decoded, target])
+        th.testing.assert_close(ours, th.autograd.grad(factor * F.mse_loss(decoded, target), [decoded, target]))
 
 
 def test_consistency_loss_equals_numpy_in_both_reductions() -> None:

@@ -1,0 +1,49 @@
+"""glibc's allocator while a model learns: freed memory stays with the process, and is given back at the end."""
+
+import subprocess
+import sys
+
+import pytest
+
+from sb3_crc.memory import _glibc
+
+FAULTS = """
+import resource, sys
+import psutil, torch as th
+from sb3_crc.memory import memory_kept
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(4):
+        th.ones(10_000_000)  # 40 MB, 9 766 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+def resident():
+    return psutil.Process().memory_info().rss
+
+faults(); before = resident()
+outside = faults()
+with memory_kept():
+    with memory_kept():
+        faults()
+    within, kept = faults(), resident() - before
+print(outside, within, kept, resident() - before, faults())
+"""
+
+
+@pytest.mark.skipif(_glibc() is None, reason="only glibc has these settings")
+def test_pages_are_touched_once_and_given_back() -> None:
+    output = subprocess.run([sys.executable, "-c", FAULTS], check=True, capture_output=True, text=True).stdout
+    outside, within, kept, afterwards, again = (int(number) for number in output.split())
+    assert outside > 4 * 9_000 and again > 4 * 9_000
+    assert within < 1_000
+    assert kept > 39e6
+    assert afterwards < 5e6
+
+
+def test_a_system_without_glibc_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sb3_crc.memory
+
+    monkeypatch.setattr(sb3_crc.memory, "_glibc", lambda: None)
+    with sb3_crc.memory.memory_kept():
+        assert sb3_crc.memory._keepers == 0
