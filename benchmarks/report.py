@@ -96,8 +96,7 @@ def print_table(title: str, rows: Sequence[dict[str, Any]], hidden: Sequence[str
     for row in rows:
         verdicts = row.get("targets", {})
         table.add_row(*(_cell(row.get(column), verdicts.get(column, "")) for column in columns))
-    console = Console()
-    console.print(table, width=max(console.width, console.measure(table).maximum), crop=False, soft_wrap=True)
+    Console(width=Console(width=1_000).measure(table).maximum).print(table)  # a terminal may wrap it, columns never shrink
 
 
 def machine() -> dict[str, Any]:
