@@ -146,19 +146,25 @@ def trials(
 
 @app.command()
 def curve(
-    run: Annotated[Path, typer.Argument(help="folder of a run, with its evaluations.npz")],
+    runs: Annotated[list[Path], typer.Argument(help="folders of runs, <method>/<run>, each with its evaluations.npz")],
     output: Annotated[Path, typer.Option(help="picture to write")] = Path("learning_curve.png"),
     action_repeat: Annotated[int, typer.Option(min=1, help="environment steps per agent step of that run")] = 1,
     baselines: Annotated[Path | None, typer.Option(help="JSON of `baselines`, drawn as lines")] = None,
     title: str = "",
 ) -> None:
-    """Draw the learning curve of a run, beside policies that have learned nothing."""
-    from sb3_crc.experiments.curves import plot_learning_curve
+    """Draw the learning curve of a run, or those of several methods and seeds, beside policies that have learned nothing."""
+    from sb3_crc.experiments.curves import plot_learning_curve, plot_learning_curves
 
     measured = {} if baselines is None else json.loads(baselines.read_text())
     references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
-    evaluations = run / "evaluations.npz"
-    plot_learning_curve(evaluations, output, action_repeat=action_repeat, title=title, references=references)
+    files = [run / "evaluations.npz" for run in runs]
+    if len(files) == 1:
+        plot_learning_curve(files[0], output, action_repeat=action_repeat, title=title, references=references)
+        return
+    methods: dict[str, list[Path]] = {}
+    for file in files:
+        methods.setdefault(file.parent.parent.name, []).append(file)
+    plot_learning_curves(methods, output, action_repeat=action_repeat, title=title, references=references)
 
 
 def _show(measured: object, output: Path | None) -> None:

@@ -1,0 +1,56 @@
+"""Pictures of learning curves show the numbers of the files."""
+
+import json
+from pathlib import Path
+
+import matplotlib.figure
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sb3_crc.cli import app
+
+
+def write_run(folder: Path, returns: dict[int, list[float]]) -> Path:
+    folder.mkdir(parents=True)
+    np.savez(folder / "evaluations.npz", timesteps=list(returns), results=list(returns.values()))
+    return folder
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[matplotlib.figure.Figure]:
+    figures: list[matplotlib.figure.Figure] = []
+    save = matplotlib.figure.Figure.savefig
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", lambda self, *a, **k: (figures.append(self), save(self, *a, **k)))
+    return figures
+
+
+def test_methods_side_by_side(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:
+    runs = [
+        write_run(tmp_path / "crc" / "seed_1", {10: [100, 200], 20: [300, 300]}),
+        write_run(tmp_path / "crc" / "seed_2", {10: [50, 50]}),
+        write_run(tmp_path / "rad" / "seed_1", {10: [10, 30]}),
+    ]
+    baselines = tmp_path / "baselines.json"
+    baselines.write_text(json.dumps({"random": {"mean": 140.0}}))
+    picture = tmp_path / "curves.png"
+    arguments = ["curve", *map(str, runs), "--output", str(picture), "--action-repeat", "8", "--baselines", str(baselines)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert picture.stat().st_size > 5_000
+    (axes,) = drawn[0].axes
+    labels = {line.get_label(): [list(map(float, values)) for values in line.get_data()] for line in axes.lines}
+    assert labels["crc, 2 seeds"] == [[80], [100]]  # the mean only where both seeds were evaluated
+    assert labels["rad, 1 seed"] == [[80], [20]]
+    assert labels["random policy (140)"][1] == [140, 140]
+    thin = [
+        list(line.get_ydata()) for line in axes.lines if line.get_linewidth() < 1 and not line.get_label().startswith("random")
+    ]
+    assert thin == [[150, 300], [50], [20]]
+
+
+def test_one_run_shows_its_episodes_range(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:
+    run = write_run(tmp_path / "crc" / "seed_1", {10: [100, 200], 20: [300, 300]})
+    assert CliRunner().invoke(app, ["curve", str(run), "--output", str(tmp_path / "curve.svg")]).exit_code == 0
+    (line,) = drawn[0].axes[0].lines
+    assert list(line.get_ydata()) == [150, 300]
+    assert drawn[0].axes[0].get_ylim()[1] > 300  # no marker is cut off
