@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
+from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder
@@ -26,6 +27,7 @@ __all__ = [
     "PixelEncoder",
     "QBiasEvalCallback",
     "ReconstructionImageCallback",
+    "TrainingCheckpoint",
     "make_dmc",
 ]
 

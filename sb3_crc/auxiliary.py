@@ -198,19 +198,24 @@ class AuxiliaryLearner:
         :param path: of the model
         :return: the file written, ``<model>.aux.zip``
         """
-        header = {
-            "format": FORMAT,
-            "settings": asdict(self.settings),
-            "n_updates": self.n_updates,
-            "model_updates": self.model._n_updates,
-        }
-        tensors = {name: th.clone(value.detach().cpu(), memory_format=th.contiguous_format) for name, value in self._state()}
+        header, tensors = self.state()
+        tensors = {name: th.clone(value.cpu(), memory_format=th.contiguous_format) for name, value in tensors.items()}
         target = aux_path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(target) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
             archive.writestr("header.json", json.dumps(header, indent=2))
             archive.writestr("tensors.safetensors", safetensors.torch.save(tensors))
         return target
+
+    def state(self) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+        """:return: what :meth:`load_state` takes; the tensors are the living ones"""
+        header = {
+            "format": FORMAT,
+            "settings": asdict(self.settings),
+            "n_updates": self.n_updates,
+            "model_updates": self.model._n_updates,
+        }
+        return header, {name: value.detach() for name, value in self._state()}
 
     def _state(self) -> Iterable[tuple[str, th.Tensor]]:
         for part, module in (("key_encoder", self.key_encoder), ("objectives", self.objectives)):

@@ -121,6 +121,18 @@ class AuxiliaryLossCallback(BaseCallback):
             raise RuntimeError("nothing to save: the callback has not been with a model in learn() yet")
         return self.learner.save(path)
 
+    def training_state(self) -> tuple[dict[str, Any], dict[str, th.Tensor]] | None:
+        """For :class:`~sb3_crc.TrainingCheckpoint`."""
+        if self.learner is None:
+            return None
+        header, tensors = self.learner.state()
+        return {name: header[name] for name in ("n_updates", "model_updates")}, tensors
+
+    def set_training_state(self, state: tuple[dict[str, Any], dict[str, th.Tensor]] | None) -> None:
+        """:raises ValueError: if it belongs to other objectives"""
+        if state is not None and self.learner is not None:
+            self.learner.load_state(*state)
+
     def _init_callback(self) -> None:
         extractor = trainable_extractor(self.model)
         if self.learner is None or self.learner.extractor is not extractor:

@@ -83,10 +83,10 @@ def load_buffer_file(buffer: FrameReplayBuffer, path: str | Path | io.BufferedIO
     source = path if isinstance(path, io.BufferedIOBase) else _find(Path(path))
     with _one_error("the stream" if isinstance(source, io.BufferedIOBase) else str(source)):
         if isinstance(source, Path) and source.is_dir():
-            _read(buffer, _Folder(source))
+            _read(buffer, _Folder(source), _read_index(_Folder(source)))
         elif zipfile.is_zipfile(source):
             with zipfile.ZipFile(source) as archive:
-                _read(buffer, _Archive(archive))
+                _read(buffer, _Archive(archive), _read_index(_Archive(archive)))
         else:
             if isinstance(source, io.BufferedIOBase):
                 source.seek(0)
@@ -162,6 +162,45 @@ class _Archive:
             yield file
 
 
+@dataclass(frozen=True)
+class Contents:
+    """
+    What of a buffer is to be written; it shares no memory with the buffer.
+
+    :param segments: all that the buffer needs
+    :param frames: name -> frames of the segments that are not in the folder yet
+    :param arrays: the index
+    """
+
+    segments: tuple[Segment, ...]
+    frames: dict[str, np.ndarray]
+    arrays: dict[str, np.ndarray]
+
+
+def contents(buffer: FrameReplayBuffer, folder: Path, written: tuple[Segment, ...]) -> Contents:
+    """
+    :param buffer: what is to be saved
+    :param folder: where segments lie
+    :param written: the segments that were written for this buffer before
+    """
+    segments, new = _segments(buffer, _Folder(folder), written)
+    frames = {segment.name: buffer.store.read(segment.first, segment.end) for segment in new}
+    return Contents(tuple(segments), frames, {name: values.copy() for name, values in _index(buffer, segments).items()})
+
+
+def read_contents(buffer: FrameReplayBuffer, folder: Path, index: Path) -> None:
+    """
+    Fill a buffer.
+
+    :param buffer: of the same spaces and number of environments
+    :param folder: where segments lie
+    :param index: the file with :attr:`Contents.arrays`
+    :raises ValueError: if it does not fit ``buffer``, which then stays as it was
+    """
+    with np.load(index, allow_pickle=False) as file:
+        _read(buffer, _Folder(folder), {key: file[key] for key in file.files})
+
+
 def _fill(buffer: FrameReplayBuffer, target: Path) -> None:
     folder = _Folder(target)
     buffer.segments = _write(buffer, folder, buffer.segments)
@@ -169,15 +208,30 @@ def _fill(buffer: FrameReplayBuffer, target: Path) -> None:
 
 
 def _write(buffer: FrameReplayBuffer, container: _Folder | _Archive, written: tuple[Segment, ...]) -> tuple[Segment, ...]:
-    store, size = buffer.store, buffer.size()
-    segments = _still_good(container, written, store.first)
-    for start in range(segments[-1].end if segments else store.first, store.end, SEGMENT):
-        end = min(start + SEGMENT, store.end)
-        segment = Segment(f"frames-{start:012d}-{uuid.uuid4().hex[:12]}.npy", start, end)
+    segments, new = _segments(buffer, container, written)
+    for segment in new:
         with container.writing(segment.name) as file:
-            np.lib.format.write_array(file, store.read(start, end), allow_pickle=False)
-        segments.append(segment)
+            np.lib.format.write_array(file, buffer.store.read(segment.first, segment.end), allow_pickle=False)
+    with container.writing(INDEX) as file:
+        np.savez(file, **_index(buffer, segments))  # type: ignore[arg-type]
+    return tuple(segments)
 
+
+def _segments(
+    buffer: FrameReplayBuffer, container: _Folder | _Archive, written: tuple[Segment, ...]
+) -> tuple[list[Segment], list[Segment]]:
+    """:return: all segments, and those of them that are to be written"""
+    store = buffer.store
+    good = _still_good(container, written, store.first)
+    new = []
+    for start in range(good[-1].end if good else store.first, store.end, SEGMENT):
+        end = min(start + SEGMENT, store.end)
+        new.append(Segment(f"frames-{start:012d}-{uuid.uuid4().hex[:12]}.npy", start, end))
+    return good + new, new
+
+
+def _index(buffer: FrameReplayBuffer, segments: list[Segment]) -> dict[str, np.ndarray]:
+    store, size = buffer.store, buffer.size()
     header = {
         "format": FORMAT,
         **_description(buffer),
@@ -191,9 +245,7 @@ def _write(buffer: FrameReplayBuffer, container: _Folder | _Archive, written: tu
         "segments": [asdict(segment) for segment in segments],
     }
     arrays = {name: values[:size] for name, values in buffer.arrays().items()}
-    with container.writing(INDEX) as file:
-        np.savez(file, **{"header": np.array(json.dumps(header)), **arrays})  # type: ignore[arg-type]
-    return tuple(segments)
+    return {"header": np.array(json.dumps(header)), **arrays}
 
 
 def _still_good(container: _Folder | _Archive, written: tuple[Segment, ...], first: int) -> list[Segment]:
@@ -219,9 +271,12 @@ def _description(buffer: FrameReplayBuffer) -> dict[str, Any]:
     }
 
 
-def _read(buffer: FrameReplayBuffer, container: _Folder | _Archive) -> None:
+def _read_index(container: _Folder | _Archive) -> dict[str, np.ndarray]:
     with container.reading(INDEX) as file, np.load(file, allow_pickle=False) as index:
-        arrays = {key: index[key] for key in index.files}
+        return {key: index[key] for key in index.files}
+
+
+def _read(buffer: FrameReplayBuffer, container: _Folder | _Archive, arrays: dict[str, np.ndarray]) -> None:
     header = json.loads(str(arrays.pop("header")))
     if header["format"] > FORMAT:
         raise ValueError(f"its format is {header['format']}, this version of sb3_crc reads up to {FORMAT}")

@@ -1,0 +1,129 @@
+"""The callback that saves a training and goes on with it."""
+
+import json
+import os
+import socket
+import time
+import warnings
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import torch as th
+from filelock import FileLock, Timeout
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_crc.atomic import atomic_write
+from sb3_crc.buffers import FrameReplayBuffer
+from sb3_crc.buffers.files import contents, read_contents
+from sb3_crc.checkpoints.store import INDEX, CheckpointStore
+from sb3_crc.checkpoints.training import set_training_state, training_state
+
+LOCK, OWNER, DONE = "lock", "owner.json", "DONE"
+
+
+class TrainingCheckpoint(BaseCallback):
+    """
+    Save the whole training now and then, and go on from the newest checkpoint when training starts: run the same script again,
+    and it ends as it would have without the interruption, bit for bit on a CPU with the same number of threads.
+
+    Checkpoints are taken where a rollout starts, the only point at which environments, replay buffer, counters and networks
+    agree, and at the end; they are written beside the training. The file DONE tells that the training has ended.
+
+    :param folder: of the checkpoints of this run
+    :param every: agent steps between two checkpoints, rounded up to the next start of a rollout
+    :param keep: how many of the newest stay
+    :param verbose: 1: say from where the training goes on
+    :raises ValueError: for arguments that cannot work; when training starts, if another process uses the folder, if what is in
+        it is damaged or does not fit the model, or if the model's replay buffer is not a FrameReplayBuffer
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(self, folder: str | Path, every: int = 1_000, keep: int = 2, verbose: int = 0):
+        super().__init__(verbose)
+        if every < 1:
+            raise ValueError(f"every={every} must be at least 1")
+        self.every = every
+        self.store = CheckpointStore(Path(folder), keep)
+        self._saved_at = 0
+        self._lock = FileLock(Path(folder) / LOCK)
+        self._writer: ThreadPoolExecutor | None = None
+        self._writing: Future[Path] | None = None
+
+    def _init_callback(self) -> None:
+        if not isinstance(getattr(self.model, "replay_buffer", None), FrameReplayBuffer):
+            name = type(getattr(self.model, "replay_buffer", None)).__name__
+            raise ValueError(
+                f"TrainingCheckpoint saves a FrameReplayBuffer, frame by frame; the model has a {name}: "
+                "replay_buffer_class=FrameReplayBuffer"
+            )
+        self._take_lock()
+
+    def _on_training_start(self) -> None:
+        self._writer = ThreadPoolExecutor(1, "checkpoint")
+        checkpoint = self.store.newest()
+        if checkpoint is None:
+            self._saved_at = self.model.num_timesteps
+            return
+        if checkpoint.threads != th.get_num_threads():
+            warnings.warn(
+                f"{checkpoint.path} was written with {checkpoint.threads} threads, now there are {th.get_num_threads()}: the "
+                "training goes on, but rounds otherwise",
+                stacklevel=2,
+            )
+        buffer = self.model.replay_buffer
+        assert isinstance(buffer, FrameReplayBuffer)
+        read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
+        set_training_state(self.model, self.locals["callback"], checkpoint.state)
+        self._saved_at = self.num_timesteps = self.model.num_timesteps
+        if self.verbose > 0:
+            print(f"Going on from {checkpoint.path}")
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps - self._saved_at >= self.every:
+            self._save()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.model.num_timesteps > self._saved_at:
+            self._save()
+        self._finish_writing()
+        assert self._writer is not None
+        self._writer.shutdown()
+        if self.model.num_timesteps >= self.model._total_timesteps:
+            with atomic_write(self.store.folder / DONE) as unfinished:
+                unfinished.write_text(f"{self.model.num_timesteps}\n", encoding="utf-8")
+        self._lock.release()
+
+    def _save(self) -> None:
+        """Copy what is to be written, and leave the writing to another thread."""
+        self._finish_writing()
+        buffer, steps = self.model.replay_buffer, self.model.num_timesteps
+        assert isinstance(buffer, FrameReplayBuffer)
+        assert self._writer is not None
+        self._saved_at = steps
+        replay = contents(buffer, self.store.segments, buffer.segments)
+        state = training_state(self.model, self.locals["callback"])
+        buffer.segments = replay.segments
+        self._writing = self._writer.submit(self.store.save, steps, state, replay)
+
+    def _finish_writing(self) -> None:
+        """:raises OSError: if the last checkpoint could not be written"""
+        if self._writing is not None:
+            self._writing.result()
+            self._writing = None
+
+    def _take_lock(self) -> None:
+        self.store.folder.mkdir(parents=True, exist_ok=True)
+        owner = self.store.folder / OWNER
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            who = owner.read_text(encoding="utf-8").strip() if owner.exists() else "unknown"
+            raise ValueError(f"{self.store.folder} is in use by another training: {who}") from None
+        (self.store.folder / DONE).unlink(missing_ok=True)
+        about = {"pid": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+        owner.write_text(json.dumps(about) + "\n", encoding="utf-8")

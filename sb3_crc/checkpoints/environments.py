@@ -1,0 +1,99 @@
+"""The state of a vectorised environment: what its wrappers keep, and each environment's own ``get_state``."""
+
+import warnings
+from typing import Any
+
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+
+from sb3_crc.checkpoints.tree import Tree, copied, is_plain
+
+#: What SB3's Monitor keeps of the present episode and of those before
+MONITOR = ("rewards", "needs_reset", "episode_returns", "episode_lengths", "episode_times", "total_steps")
+
+
+def vec_env_state(env: VecEnv) -> Tree:
+    """
+    :param env: environments, whatever they are wrapped in
+    :return: what their future depends on. Of environments without ``get_state`` only wrappers are held: these go on at their
+        next reset, which is not exact, and :func:`set_vec_env_state` says so
+    """
+    wrappers = []
+    while isinstance(env, VecEnvWrapper):
+        wrappers.append(_plain_attributes(env))
+        env = env.venv
+    exact = all(env.has_attr(name) for name in ("get_state", "set_state"))
+    return {
+        "wrappers": wrappers,
+        "environments": env.env_method("get_state") if exact else None,
+        "monitors": [copied(env.get_attr(name)) for name in MONITOR] if all(env.env_is_wrapped(Monitor)) else None,
+        "action_space": env.action_space.np_random.bit_generator.state,
+    }
+
+
+def set_vec_env_state(env: VecEnv, state: Tree) -> bool:
+    """
+    :param env: made as the one that was saved, and reset
+    :param state: of :func:`vec_env_state`
+    :return: whether it goes on exactly where it was; False: at the next reset, as after the one that ``env`` has just had
+    :raises ValueError: if the environments are others
+    """
+    for attributes in state["wrappers"]:
+        if not isinstance(env, VecEnvWrapper):
+            raise ValueError(f"{len(state['wrappers'])} wrappers were saved, this environment has fewer")
+        _set_attributes(env, attributes)
+        env = env.venv
+    if isinstance(env, VecEnvWrapper):
+        raise ValueError(f"{len(state['wrappers'])} wrappers were saved, this environment has more")
+    env.action_space.np_random.bit_generator.state = state["action_space"]
+    if state["environments"] is None:
+        warnings.warn(
+            "the environments have no get_state() and set_state(): the run goes on at the start of an episode, "
+            "so it will not be bit for bit the one that was stopped",
+            stacklevel=2,
+        )
+        return False
+    if len(state["environments"]) != env.num_envs:
+        raise ValueError(f"{len(state['environments'])} environments were saved, there are {env.num_envs} now")
+    for index, own in enumerate(state["environments"]):
+        env.env_method("set_state", own, indices=index)
+    for name, values in zip(MONITOR, state["monitors"] or [], strict=False):
+        for index, value in enumerate(values):
+            env.env_method("set_wrapper_attr", name, copied(value), indices=index)
+    return True
+
+
+def _plain_attributes(wrapper: VecEnvWrapper) -> Tree:
+    """VecFrameStack's stack, VecNormalize's moments, VecMonitor's sums: whatever is plain data or made of it."""
+    plain, inner = {}, {}
+    for name, value in vars(wrapper).items():
+        if (state := _inner(value)) is not None:
+            inner[name] = state
+        elif is_plain(value):
+            plain[name] = copied(value)
+    return {"plain": plain, "inner": inner}
+
+
+def _inner(value: Any) -> Tree | None:
+    """:return: of the objects in which SB3's wrappers keep their state, their attributes"""
+    if isinstance(value, dict) and value and all(isinstance(part, RunningMeanStd) for part in value.values()):
+        return {"parts": {name: _inner(part) for name, part in value.items()}}
+    if not isinstance(value, RunningMeanStd | StackedObservations):
+        return None
+    return {"attributes": {name: copied(part) for name, part in vars(value).items() if is_plain(part)}}
+
+
+def _set_inner(value: Any, state: Tree) -> None:
+    for name, part in state.get("parts", {}).items():
+        _set_inner(value[name], part)
+    for name, part in state.get("attributes", {}).items():
+        setattr(value, name, copied(part))
+
+
+def _set_attributes(wrapper: VecEnvWrapper, attributes: Tree) -> None:
+    for name, value in attributes["plain"].items():
+        setattr(wrapper, name, copied(value))
+    for name, state in attributes["inner"].items():
+        _set_inner(getattr(wrapper, name), state)

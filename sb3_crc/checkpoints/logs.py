@@ -1,0 +1,80 @@
+"""Files that SB3 opens anew when a script starts: what a stopped run had written is written again, and then continued."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TextIO
+
+import gymnasium as gym
+from stable_baselines3.common.logger import CSVOutputFormat, JSONOutputFormat, Logger
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
+
+from sb3_crc.checkpoints.tree import Tree, copied, is_plain
+
+
+def log_state(logger: Logger, env: VecEnv) -> Tree:
+    """
+    :param logger: of the model; TensorBoard's files are not held: a new one is begun, whose steps overlap
+    :param env: of the training; Monitor's files are held where the environments live in this process
+    :return: what was recorded since the log was last written (figures and the like left out), and the files' contents
+    """
+    values = {name: value for name, value in logger.name_to_value.items() if is_plain(value)}
+    excluded = {name: value for name, value in logger.name_to_excluded.items() if name in values}
+    formats = list(_formats(logger))
+    return {
+        "recorded": copied({"values": values, "counts": dict(logger.name_to_count), "excluded": excluded}),
+        "progress": [_read(format_.file) for format_ in formats],
+        "keys": [list(format_.keys) if isinstance(format_, CSVOutputFormat) else None for format_ in formats],
+        "monitors": [_read(monitor.results_writer.file_handler) for monitor in _monitors(env)],
+        "seconds": [time.time() - monitor.t_start for monitor in _monitors(env)],
+    }
+
+
+def set_log_state(logger: Logger, env: VecEnv, state: Tree) -> None:
+    """
+    :param logger: with the formats of the one that was saved; the files of others stay as they are
+    :param env: likewise
+    :param state: of :func:`log_state`
+    """
+    recorded = copied(state["recorded"])
+    logger.name_to_value.update(recorded["values"])
+    logger.name_to_count.update(recorded["counts"])
+    logger.name_to_excluded.update(recorded["excluded"])
+    for format_, text, keys in zip(_formats(logger), state["progress"], state["keys"], strict=False):
+        _write(format_.file, text)
+        if isinstance(format_, CSVOutputFormat):
+            format_.keys = list(keys)
+    for monitor, text, seconds in zip(_monitors(env), state["monitors"], state["seconds"], strict=False):
+        _write(monitor.results_writer.file_handler, text)
+        monitor.t_start = time.time() - seconds
+
+
+def _formats(logger: Logger) -> Iterator[CSVOutputFormat | JSONOutputFormat]:
+    yield from (one for one in logger.output_formats if isinstance(one, CSVOutputFormat | JSONOutputFormat))
+
+
+def _monitors(env: VecEnv) -> Iterator[Any]:
+    """Those that write files."""
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecMonitor) and env.results_writer is not None:
+            yield env
+        env = env.venv
+    for one in env.envs if isinstance(env, DummyVecEnv) else []:
+        wrapper: gym.Env[Any, Any] = one
+        while isinstance(wrapper, gym.Wrapper):
+            if isinstance(wrapper, Monitor) and wrapper.results_writer is not None:
+                yield wrapper
+            wrapper = wrapper.env
+
+
+def _read(file: TextIO) -> str:
+    file.flush()
+    return Path(file.name).read_text(encoding="utf-8")
+
+
+def _write(file: TextIO, text: str) -> None:
+    file.seek(0)
+    file.truncate()
+    file.write(text)
+    file.flush()

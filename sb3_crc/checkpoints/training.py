@@ -1,0 +1,156 @@
+"""Everything on which the future of a training depends, but for the frames of the replay buffer."""
+
+from collections.abc import Iterator
+from inspect import signature
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+
+from sb3_crc.checkpoints.environments import set_vec_env_state, vec_env_state
+from sb3_crc.checkpoints.logs import log_state, set_log_state
+from sb3_crc.checkpoints.tree import Tree, copied, is_plain, random_states, set_random_states
+
+#: Counters, the last observation, and the episodes that the log's means are over. ``_total_timesteps`` is not among them: it
+#: is what ``learn`` was called with
+COUNTERS = (
+    "num_timesteps",
+    "_episode_num",
+    "_n_updates",
+    "_n_calls",
+    "_current_progress_remaining",
+    "exploration_rate",
+    "_last_obs",
+    "_last_episode_starts",
+    "_last_original_obs",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "_env_steps",
+)
+#: Of a callback: what every callback has of the training, and what only describes the present moment
+NOT_STATE = ("locals", "globals", "verbose")
+
+
+def training_state(model: OffPolicyAlgorithm, callback: BaseCallback) -> Tree:
+    """
+    :param model: at the start of a rollout, where environments, counters, buffer and networks agree
+    :param callback: the root of the callbacks that ``learn`` was given
+    :return: a tree of plain data, which shares no memory with the model
+    """
+    state_dicts, variables = model._get_torch_save_params()
+    assert model.env is not None
+    return {
+        "random": random_states(),
+        "networks": copied({name: recursive_getattr(model, name).state_dict() for name in state_dicts}),
+        "variables": copied({name: recursive_getattr(model, name) for name in variables}),
+        "counters": {name: copied(getattr(model, name)) for name in COUNTERS if hasattr(model, name)},
+        "collapse_alarm": getattr(getattr(model, "_collapse_alarm", None), "_updates", None),
+        "action_noise": _noise_state(model.action_noise),
+        "action_space": model.action_space.np_random.bit_generator.state,
+        "environment": vec_env_state(model.env),
+        "log": log_state(model.logger, model.env),
+        "callbacks": [callback_state(one) for one in callback_tree(callback)],
+    }
+
+
+def set_training_state(model: OffPolicyAlgorithm, callback: BaseCallback, state: Tree) -> None:
+    """
+    Go on where :func:`training_state` was called.
+
+    :param model: made with the same arguments, in environments made the same, after ``_setup_learn``
+    :param callback: the same callbacks
+    :param state: is not changed
+    :raises ValueError: if anything does not fit, naming it; the model is then not to be used
+    """
+    assert model.env is not None
+    start = model._last_obs, model._last_original_obs
+    for name, value in state["networks"].items():
+        _load(name, recursive_getattr(model, name), copied(value))
+    for name, value in state["variables"].items():
+        recursive_getattr(model, name).data.copy_(value)
+    for name, value in state["counters"].items():
+        setattr(model, name, copied(value))
+    if state["collapse_alarm"] is not None:
+        model._collapse_alarm._updates = state["collapse_alarm"]  # type: ignore[attr-defined]
+    _set_noise_state(model.action_noise, state["action_noise"])
+    model.action_space.np_random.bit_generator.state = state["action_space"]
+    if not set_vec_env_state(model.env, state["environment"]):  # they stand at the start of an episode
+        model._last_obs, model._last_original_obs = start
+        model._last_episode_starts = np.ones(model.env.num_envs, dtype=bool)
+    set_log_state(model.logger, model.env, state["log"])
+    callbacks = list(callback_tree(callback))
+    names = [type(one).__name__ for one in callbacks]
+    saved_names = [one["name"] for one in state["callbacks"]]
+    if names != saved_names:
+        raise ValueError(f"the callbacks are {', '.join(names)}; those of the saved run were {', '.join(saved_names)}")
+    for one, own in zip(callbacks, state["callbacks"], strict=True):
+        set_callback_state(one, own)
+    set_random_states(state["random"])
+
+
+def callback_tree(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """:param callback: the root; :return: it and all callbacks below it, in an order that depends on nothing else"""
+    yield callback
+    children: list[BaseCallback | None] = list(callback.callbacks) if isinstance(callback, CallbackList) else []
+    if isinstance(callback, EventCallback):
+        children.append(callback.callback)
+    if isinstance(callback, EvalCallback):
+        children.append(callback.callback_on_new_best)
+    for child in children:
+        if child is not None:
+            yield from callback_tree(child)
+
+
+def callback_state(callback: BaseCallback) -> Tree:
+    """
+    :param callback: any; one that keeps more than plain data may have methods ``training_state()`` and
+        ``set_training_state(state)``
+    :return: its attributes that are plain data, without its constructor's arguments, and its evaluation environment's state
+    """
+    classes = [cls for cls in type(callback).__mro__ if issubclass(cls, BaseCallback)]
+    arguments = {name for cls in classes for name in signature(cls).parameters}
+    attributes = {
+        name: copied(value)
+        for name, value in vars(callback).items()
+        if name not in arguments and name not in NOT_STATE and is_plain(value)
+    }
+    state = {"name": type(callback).__name__, "attributes": attributes}
+    if isinstance(callback, EvalCallback):
+        state["environment"] = vec_env_state(callback.eval_env)
+    if hasattr(callback, "training_state"):
+        state["own"] = copied(callback.training_state())
+    return state
+
+
+def set_callback_state(callback: BaseCallback, state: Tree) -> None:
+    """:param callback: of the same class; :param state: of :func:`callback_state`"""
+    vars(callback).update(copied(state["attributes"]))
+    if isinstance(callback, EvalCallback):
+        callback.eval_env.reset()
+        set_vec_env_state(callback.eval_env, state["environment"])
+    if "own" in state:
+        callback.set_training_state(copied(state["own"]))  # type: ignore[attr-defined]
+
+
+def _load(name: str, target: Any, value: Tree) -> None:
+    try:
+        target.load_state_dict(value)
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise ValueError(f"{name} is not the one that was saved: {error}") from error
+
+
+def _noise_state(noise: ActionNoise | None) -> Tree:
+    if isinstance(noise, VectorizedActionNoise):
+        return [_noise_state(one) for one in noise.noises]
+    return None if noise is None else {name: copied(value) for name, value in vars(noise).items() if is_plain(value)}
+
+
+def _set_noise_state(noise: ActionNoise | None, state: Tree) -> None:
+    if isinstance(noise, VectorizedActionNoise):
+        for one, own in zip(noise.noises, state, strict=True):
+            _set_noise_state(one, own)
+    elif noise is not None:
+        vars(noise).update(copied(state))
