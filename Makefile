@@ -5,7 +5,7 @@ SHELL := /bin/sh
 PYTHON ?=                                   # an interpreter, 3.10 to 3.12; empty: the first suitable one
 ARGS ?=                                     # more flags for `make train` or pytest
 TRAIN_ARGS = --algo crc --env dmc_pixels/cartpole-swingup-v0 --conf-file zoo_configs/laptop.yml --progress \
-	--eval-freq 625 --eval-episodes 5 --verbose 0 -f logs $(ARGS)
+	--eval-freq 625 --eval-episodes 5 --checkpoint-every 1000 --verbose 0 -f logs $(ARGS)
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 # Two test processes share two cores: more threads each would only wait for one another.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1

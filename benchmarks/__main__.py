@@ -44,6 +44,58 @@ def update(
     publish("update", "One update (* changes the mathematics)", rows, _command(), by=titles, folder=output)
 
 
+@app.command()
+def env(
+    repeats: Annotated[int, typer.Option(min=1, help="Decisions of each environment that are timed, in turn.")] = 100,
+    task: Annotated[list[str] | None, typer.Option(help="domain-task; default: the paper's ten.")] = None,
+    quality: Annotated[list[str], typer.Option(help="benchmark, fast")] = ["benchmark", "fast"],  # noqa: B006
+    image_size: Annotated[int, typer.Option(min=1, help="Side of the pictures in pixels.")] = 100,
+    output: Folder = RESULTS,
+) -> None:
+    """make_dmc against dm_control alone and the usual chain of wrappers."""
+    from benchmarks.env import measure
+    from sb3_crc.envs.tasks import PAPER_TASKS
+
+    tasks = tuple(task or PAPER_TASKS)
+    with console.status("") as status:
+        told = lambda done: status.update(f"{done} of {len(tasks) * len(quality)} environments")  # noqa: E731
+        told(0)
+        rows = measure(tasks, quality, repeats=repeats, image_size=image_size, on_row=told)
+    publish("env", f"A decision with a picture of {image_size} pixels", rows, _command(), by=("quality",), folder=output)
+
+
+@app.command()
+def end_to_end(
+    decisions: Annotated[int, typer.Option(min=1, help="Decisions, with one update each, that are timed.")] = 200,
+    networks: Annotated[list[str], typer.Option(help="paper, laptop")] = ["paper", "laptop"],  # noqa: B006
+    preset: Annotated[list[str], typer.Option(help="Presets beside the peer.")] = ["crc", "rad"],  # noqa: B006
+    batch: Annotated[int, typer.Option(min=2, help="Batch size.")] = 128,
+    quality: Annotated[str, typer.Option(help="benchmark, fast")] = "benchmark",
+    output: Folder = RESULTS,
+) -> None:
+    """Where the time of learn() goes, in CRCSAC and in stock SB3 SAC; and how long acting takes."""
+    from benchmarks.end_to_end import TASK, acting, measure
+    from benchmarks.networks import NETWORKS
+
+    rows, acting_rows = [], []
+    with console.status("") as status:
+        for network in networks:
+            told = lambda method, network=network: status.update(f"{network} networks: {method}")  # noqa: E731
+            rows += measure(
+                networks=NETWORKS[network],
+                presets=tuple(preset),
+                decisions=decisions,
+                batch_size=batch,
+                render_quality=quality,
+                on_method=told,
+            )
+            told("acting")
+            acting_rows += acting(NETWORKS[network])
+    title = f"learn() on {TASK}, batch {batch}, render quality {quality}"
+    publish("end_to_end", title, rows, _command(), by=("networks", "unit"), folder=output)
+    publish("acting", "predict() on one observation", acting_rows, _command(), folder=output)
+
+
 def _command() -> str:
     return " ".join(["python -m benchmarks", *sys.argv[1:]])
 

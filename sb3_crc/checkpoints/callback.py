@@ -10,14 +10,14 @@ from pathlib import Path
 
 import torch as th
 from filelock import FileLock, Timeout
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.buffers.files import contents, read_contents
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
-from sb3_crc.checkpoints.training import set_training_state, training_state
+from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
 
 LOCK, OWNER, DONE = "lock", "owner.json", "DONE"
 
@@ -77,6 +77,9 @@ class TrainingCheckpoint(BaseCallback):
         read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
         set_training_state(self.model, self.locals["callback"], checkpoint.state)
         self._saved_at = self.num_timesteps = self.model.num_timesteps
+        for one in callback_tree(self.locals["callback"]):
+            if isinstance(one, ProgressBarCallback):
+                one.pbar.update(self.num_timesteps)
         if self.verbose > 0:
             print(f"Going on from {checkpoint.path}")
 
@@ -88,14 +91,22 @@ class TrainingCheckpoint(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
+        if self._writer is None:  # rl_zoo3 calls this once more
+            return
         if self.model.num_timesteps > self._saved_at:
             self._save()
         self._finish_writing()
-        assert self._writer is not None
-        self._writer.shutdown()
         if self.model.num_timesteps >= self.model._total_timesteps:
             with atomic_write(self.store.folder / DONE) as unfinished:
                 unfinished.write_text(f"{self.model.num_timesteps}\n", encoding="utf-8")
+        self.close()
+
+    def close(self) -> None:
+        """Finish what is being written, and leave the folder to others; where training ends by itself, this is done."""
+        self._finish_writing()
+        if self._writer is not None:
+            self._writer.shutdown()
+            self._writer = None
         self._lock.release()
 
     def _save(self) -> None:

@@ -18,7 +18,9 @@ from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.zoo.algorithms import preset_class, register, watched
 from sb3_crc.zoo.figures import figures, normalized_inputs, split_figures_flag
+from sb3_crc.zoo.manager import CRCExperimentManager
 from sb3_crc.zoo.messages import say
+from sb3_crc.zoo.resume import read_plan
 
 PROGRAM = "python -m sb3_crc.zoo"
 Flags = list[str]
@@ -28,6 +30,9 @@ def train() -> None:
     """Run rl_zoo3's training script on ``sys.argv``."""
     logging.basicConfig(format="%(message)s")
     register()
+    program, *flags = sys.argv
+    plan = CRCExperimentManager.plan = read_plan(flags)
+    sys.argv = [program, *plan.flags]
     try:
         rl_zoo3.train.train()
     except KeyboardInterrupt:

@@ -22,10 +22,12 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crc.analysis.films import film
+from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.zoo.messages import say
+from sb3_crc.zoo.resume import CHECKPOINTS, Plan, write_plan
 from sb3_crc.zoo.search import ARGUMENTS, constructor_arguments, sample
 
 logger = logging.getLogger(__name__)
@@ -40,11 +42,17 @@ class CRCExperimentManager(ExperimentManager):
     a search does not draw. Arguments are the zoo's.
     """
 
+    #: Whether there are checkpoints, and whether a run goes on
+    plan = Plan([], None, None)
+
     def __init__(self, args: Any, algo: str, *rest: Any, **kwargs: Any):
         own_config = CONFIGS / f"{algo}.yml"
         if kwargs.get("config") is None and own_config.exists():
             kwargs["config"] = str(own_config)
         super().__init__(args, algo, *rest, **kwargs)
+        if self.plan.run is not None:
+            self.save_path = str(self.plan.run)
+            self.params_path = str(self.plan.run / str(self.env_name))
         self._configuration: dict[str, Any] = {}
         self._study: optuna.Study | None = None
 
@@ -91,7 +99,18 @@ class CRCExperimentManager(ExperimentManager):
     def learn(self, model: BaseAlgorithm) -> None:
         """Train until done or interrupted (Ctrl-C), logging to ``progress.csv`` and TensorBoard."""
         model.set_logger(self._make_logger(model))
-        super().learn(model)
+        if self.plan.checkpoint_every is None:
+            super().learn(model)
+            return
+        run = Path(self.save_path)
+        if self.plan.run is None:
+            write_plan(self.plan, run)
+        checkpoint = TrainingCheckpoint(run / CHECKPOINTS, self.plan.checkpoint_every, verbose=1)
+        self.callbacks.append(checkpoint)  # the last one: the others have started when it restores them
+        try:
+            super().learn(model)
+        finally:
+            checkpoint.close()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """Save the final model, draw the learning curve, film the best policy, and say how to go on."""
@@ -138,6 +157,9 @@ class CRCExperimentManager(ExperimentManager):
     def _how_to_go_on(self, done: int) -> str:
         more = self.n_timesteps - done if done < self.n_timesteps else self.n_timesteps
         state = "finished" if done >= self.n_timesteps else f"stopped at {done} of {self.n_timesteps} agent steps"
+        if self.plan.checkpoint_every is not None and done < self.n_timesteps:
+            command = [*sys.orig_argv[: sys.orig_argv.index(sys.argv[0]) + 1], "--resume", self.save_path]
+            return f"Training {state}. To go on from the last checkpoint: {shlex.join(command)}"
         # The last of two equal flags counts, so the run's own command keeps its settings.
         command = [*sys.orig_argv, "-i", os.path.join(self.save_path, f"{self.env_name}.zip"), "-n", str(more)]
         return f"Training {state}. To go on: {shlex.join(command)}"

@@ -64,8 +64,7 @@ def train(
     try:
         model.learn(steps, callback=[checkpoint, Stop(stop)])
     except StoppedError:
-        checkpoint._finish_writing()  # what a kill does to an unfinished one is another test's
-        checkpoint._lock.release()
+        checkpoint.close()  # what a kill does to an unfinished one is another test's
     return model
 
 
@@ -204,8 +203,7 @@ def test_a_stock_algorithm_with_auxiliary_losses_goes_on_exactly(tmp_path: Path)
         try:
             model.learn(STEPS, callback=[auxiliary, Stop(stop), checkpoint])
         except StoppedError:
-            checkpoint._finish_writing()
-            checkpoint._lock.release()
+            checkpoint.close()
         return model, auxiliary
 
     whole, losses = run(tmp_path / "whole", 0, None)
@@ -230,8 +228,7 @@ def test_files_of_the_log_go_on_where_the_checkpoint_was(tmp_path: Path) -> None
         try:
             model.learn(80, callback=[evaluation, Stop(stop), checkpoint], log_interval=1)
         except StoppedError:
-            checkpoint._finish_writing()
-            checkpoint._lock.release()
+            checkpoint.close()
         model.logger.close()
 
     def timeless(folder: Path) -> tuple[Any, ...]:
@@ -308,7 +305,7 @@ def test_a_writer_that_fails_leaves_what_was_there(
         checkpoint = TrainingCheckpoint(tmp_path, every=10)
         with pytest.raises(Full):
             model.learn(STEPS, callback=[checkpoint, Stop(None)])
-        checkpoint._lock.release()
+        checkpoint.close()
     assert_equal(train(tmp_path, seed=0), whole)
 
 

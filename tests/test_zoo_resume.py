@@ -1,0 +1,89 @@
+"""train.py --checkpoint-every and --resume: a killed run goes on in its own folder to the end that it would have had."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_crc import CRCSAC
+from sb3_crc.zoo.resume import CHECKPOINTS, FLAGS, Plan, read_plan, write_plan
+from tests.test_zoo import ROOT, command, environment
+
+RUN = "crc/dmc_pixels-cartpole-swingup-v0_1"
+MODEL = "dmc_pixels-cartpole-swingup-v0.zip"
+
+
+def test_own_flags_are_taken_out() -> None:
+    assert read_plan(["--algo", "crc", "-n", "10"]) == Plan(["--algo", "crc", "-n", "10"], None, None)
+    assert read_plan(["--algo", "crc", "--checkpoint-every", "50", "-n", "10"]) == Plan(
+        ["--algo", "crc", "-n", "10"], 50, None
+    )
+
+
+def test_a_run_goes_on_with_its_flags_and_later_ones_count(tmp_path: Path) -> None:
+    write_plan(Plan(["--algo", "crc", "-params", "gamma:0.9"], 50, None), tmp_path)
+    assert read_plan(["--resume", str(tmp_path)]) == Plan(["--algo", "crc", "-params", "gamma:0.9"], 50, tmp_path)
+    plan = read_plan(["--resume", str(tmp_path), "-n", "99", "--checkpoint-every", "7"])
+    assert (plan.flags[-2:], plan.checkpoint_every) == (["-n", "99"], 7)
+
+
+def test_what_cannot_go_on_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for flags, message in (
+        (["--resume", str(tmp_path)], "no checkpoints of a run made with --checkpoint-every"),
+        (["--checkpoint-every", "0"], "must be at least 1"),
+        (["--resume", str(tmp_path), "-i", "model.zip"], "exclude each other"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            read_plan(flags)
+        assert stop.value.code == 2
+        assert message in capsys.readouterr().err
+    write_plan(Plan([], 50, None), tmp_path)
+    (tmp_path / CHECKPOINTS / "DONE").write_text("100\n")
+    with pytest.raises(SystemExit, match="has ended; to prolong it, add -n"):
+        read_plan(["--resume", str(tmp_path)])
+    assert read_plan(["--resume", str(tmp_path), "-n", "200"]).run == tmp_path
+
+
+def results(folder: Path) -> tuple[Any, ...]:
+    """Everything that a run leaves, but times."""
+    with (folder / "progress.csv").open() as file:
+        progress = [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+    monitor = [line.rsplit(",", 1)[0] for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
+    with np.load(folder / "evaluations.npz") as data:
+        evaluations = {name: data[name].tolist() for name in data.files}
+    return progress, monitor, evaluations
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_as_it_would_have(tmp_path: Path) -> None:
+    flags = ["-n", "400", "--eval-freq", "100", "--eval-episodes", "1", "--verbose", "0", "--checkpoint-every", "40"]
+    whole = subprocess.run(command(tmp_path / "whole", *flags), cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert whole.returncode == 0, whole.stderr[-2000:]
+    first = subprocess.Popen(command(tmp_path / "killed", *flags), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL)
+    folder = tmp_path / "killed" / RUN
+    deadline = time.time() + 200
+    while not (folder / CHECKPOINTS / "000000000120").exists():
+        assert first.poll() is None and time.time() < deadline
+        time.sleep(0.05)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    resume = [sys.executable, "train.py", "--resume", str(folder)]
+    second = subprocess.run(resume, cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert second.returncode == 0, second.stderr[-2000:]
+    assert "Going on from" in second.stdout
+    assert not (tmp_path / "killed" / "crc" / "dmc_pixels-cartpole-swingup-v0_2").exists()
+    assert results(folder) == results(tmp_path / "whole" / RUN)
+    one, other = (CRCSAC.load(path / MODEL).policy.state_dict() for path in (folder, tmp_path / "whole" / RUN))
+    assert all(th.equal(value, other[name]) for name, value in one.items())
+    assert json.loads((folder / CHECKPOINTS / FLAGS).read_text())["checkpoint_every"] == 40
+
+    again = subprocess.run(resume, cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert again.returncode == 1 and "has ended" in again.stderr
