@@ -11,7 +11,7 @@ TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 STAMP := .venv/.installed-$(shell cat pyproject.toml constraints.txt | cksum | tr ' ' '-')
 
-.PHONY: help train test test-slow test-long lint constraints doctor clean install rendering
+.PHONY: help train test test-slow test-long bench lint constraints doctor clean install rendering
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
@@ -28,6 +28,9 @@ test-slow: rendering ## the slow tests: real environments, real training runs
 
 test-long: rendering ## the tests that take hours
 	@.venv/bin/python -m pytest -m long $(ARGS) || [ $$? -eq 5 ]
+
+bench: rendering ## speed and memory beside peers, two hours on two idle cores; one alone: make bench ARGS=update
+	@.venv/bin/python -m benchmarks $(or $(ARGS),all)
 
 lint: $(STAMP) ## style, types, import contracts, docstrings
 	.venv/bin/ruff check .

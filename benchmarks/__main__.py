@@ -1,4 +1,4 @@
-"""The command line: ``python -m benchmarks [NAME ...]``, by default all of them; ``make bench``."""
+"""The command line: ``python -m benchmarks NAME``; ``make bench`` runs all of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from benchmarks.report import RESULTS, publish
 
-app = typer.Typer(add_completion=False, help=__doc__)
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 console = Console(stderr=True)
 Repeats = Annotated[int, typer.Option(min=1, help="Rounds, in each of which every program is timed once.")]
 Folder = Annotated[Path, typer.Option(help="Where the JSON files go.")]
@@ -94,6 +94,40 @@ def end_to_end(
     title = f"learn() on {TASK}, batch {batch}, render quality {quality}"
     publish("end_to_end", title, rows, _command(), by=("networks", "unit"), folder=output)
     publish("acting", "predict() on one observation", acting_rows, _command(), folder=output)
+
+
+@app.command()
+def buffer(
+    repeats: Repeats = 10,
+    size: Annotated[list[int] | None, typer.Option(help="Transitions; default: 1 000, 10 000 and 100 000.")] = None,
+    output: Folder = RESULTS,
+) -> None:
+    """FrameReplayBuffer against SB3's buffers and sb3-extra-buffers': memory, adding, sampling."""
+    from benchmarks.buffer import SIZES, measure
+
+    with console.status("") as status:
+        rows = measure(tuple(size or SIZES), repeats=repeats, tell=status.update)
+    publish("buffer", "Replay of stacks of three 100x100 frames", rows, _command(), by=("transitions",), folder=output)
+
+
+@app.command()
+def scaling(repeats: Repeats = 10, output: Folder = RESULTS) -> None:
+    """An update of crc against batch and image size."""
+    from benchmarks.scaling import measure
+
+    with console.status("") as status:
+        rows = measure(repeats=repeats, on_round=lambda done: status.update(f"{done} of {repeats}"))
+    publish("scaling", "An update of crc", rows, _command(), by=("varied",), folder=output)
+
+
+@app.command("all")
+def everything(output: Folder = RESULTS) -> None:
+    """All of these with their defaults, one after the other: two hours on two cores, which nothing else should use."""
+    update(output=output)
+    buffer(output=output)
+    env(output=output)
+    end_to_end(output=output)
+    scaling(output=output)
 
 
 def _command() -> str:
