@@ -40,8 +40,9 @@ FRAME_BYTES = int(np.prod(FRAME_SHAPE))
 SPARE, PROCESS = 2e9, 3e8
 #: Transitions that are added before the ring counts as full, as a share of its size: ours has a few more places than those
 FILL = 1.05
-#: Additions that are timed together: so few that seldom another program comes between them
-BURST = 10
+#: Additions that are timed together: so few that seldom another program comes between them, and so many that each time the
+#: kernel clears one of the 2 MB pages that SB3's arrays get
+BURST = 25
 
 #: After a buffer's name: that of the smallest size, timed beside it
 SMALLEST = ", smallest"
@@ -218,9 +219,8 @@ def add_all(buffer: ReplayBuffer, transitions: Iterable[Transition]) -> None:
 
 def filled(name: str, size: int) -> ReplayBuffer:
     """:return: a full buffer, all of whose memory has been written"""
-    buffer, transitions = make(name, size), episode()
-    for start in range(0, round(FILL * size), EPISODE):
-        add_all(buffer, transitions[: round(FILL * size) - start])
+    buffer = make(name, size)
+    add_all(buffer, islice(cycle(episode()), round(FILL * size)))
     return buffer
 
 
@@ -230,21 +230,20 @@ def grow(name: str, size: int) -> Growth:
 
     :param name: of the buffer
     :param size: in transitions
-    :return: medians over episodes: the kernel clears memory in large pieces, so that most single additions see none of it
+    :return: medians over bursts
     """
-    transitions = episode()
-    add_all(make(name, 2), transitions[:2])  # code and its libraries are not the buffer's
-    _copy_to_new_memory(transitions)
+    transitions = cycle(episode())
+    add_all(make(name, 2), islice(transitions, EPISODE))  # code and its libraries are not the buffer's
     gc.collect()
     before = psutil.Process().memory_info().rss
     buffer = make(name, size)
     adds, copies = [], []
-    for start in range(0, round(FILL * size), EPISODE):
-        part = transitions[: round(FILL * size) - start]
-        seconds = _seconds(partial(add_all, buffer, part)) / len(part)
-        if start + len(part) <= size:
+    for start in range(0, round(FILL * size), BURST):
+        burst = list(islice(transitions, BURST))
+        seconds = _seconds(partial(add_all, buffer, burst)) / BURST
+        if start + BURST <= size:
             adds.append(seconds)
-            copies.append(_copy_to_new_memory(transitions))
+            copies.append(_copy_to_new_memory(burst))
     gc.collect()
     return Growth(psutil.Process().memory_info().rss - before, statistics.median(adds), statistics.median(copies))
 
