@@ -103,11 +103,13 @@ class TrainingCheckpoint(BaseCallback):
 
     def close(self) -> None:
         """Finish what is being written, and leave the folder to others; where training ends by itself, this is done."""
-        self._finish_writing()
-        if self._writer is not None:
-            self._writer.shutdown()
-            self._writer = None
-        self._lock.release()
+        try:
+            self._finish_writing()
+        finally:
+            if self._writer is not None:
+                self._writer.shutdown()
+                self._writer = None
+            self._lock.release()
 
     def _save(self) -> None:
         """Copy what is to be written, and leave the writing to another thread."""
@@ -123,9 +125,9 @@ class TrainingCheckpoint(BaseCallback):
 
     def _finish_writing(self) -> None:
         """:raises OSError: if the last checkpoint could not be written"""
-        if self._writing is not None:
-            self._writing.result()
-            self._writing = None
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            writing.result()
 
     def _take_lock(self) -> None:
         self.store.folder.mkdir(parents=True, exist_ok=True)
