@@ -8,6 +8,7 @@ import mmap
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from itertools import count, cycle, islice
@@ -44,6 +45,8 @@ FILL = 1.05
 #: kernel clears one of the 2 MB pages that SB3's arrays get
 BURST = 25
 
+#: What is entered once and left with the process; an object that nobody holds would leave at once
+PROCESS_LONG = ExitStack()
 #: After a buffer's name: that of the smallest size, timed beside it
 SMALLEST = ", smallest"
 TARGETS = [Target("add - copy us", 60), Target("growing add - copy us", 60), Target("sample ms", 8), Target("/ smallest", 1.5)]
@@ -270,7 +273,7 @@ def sampling(name: str, size: int, batch_size: int) -> Work:
     """:return: a batch with crops of o_t and o_{t+1}, with the allocator as :meth:`CRCSAC.learn` sets it, for all buffers"""
     buffer = filled(name, size)
     sample = buffer.sample_frames if isinstance(buffer, FrameReplayBuffer) else buffer.sample
-    memory_kept().__enter__()  # for the rest of this process
+    PROCESS_LONG.enter_context(memory_kept())
 
     def work() -> None:
         samples: Any = sample(batch_size)

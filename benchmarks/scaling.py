@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,6 +22,8 @@ MARGIN = 16
 POLICY_DELAY = 2
 #: Time per sample of the largest batch, and per needed operation of any input, against those of the reference
 LARGEST_BATCH, ANY_INPUT = 1.0, 1.3
+#: What is entered once and left with the process; an object that nobody holds would leave at once
+PROCESS_LONG = ExitStack()
 
 
 def measure(
@@ -76,7 +79,7 @@ def update(networks: Networks, input_size: int, batch_size: int) -> Work:
     """
     resized = replace(networks, frame_size=input_size + MARGIN, input_size=input_size)
     model = resized.crc_sac("crc", batch_size, policy_delay=POLICY_DELAY, image_size=input_size)
-    memory_kept().__enter__()  # for the rest of this process
+    PROCESS_LONG.enter_context(memory_kept())
     return lambda: model.train(POLICY_DELAY, batch_size)
 
 

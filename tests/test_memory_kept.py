@@ -35,7 +35,7 @@ print(outside, within, kept, resident() - before, faults())
 def test_pages_are_touched_once_and_given_back() -> None:
     output = subprocess.run([sys.executable, "-c", FAULTS], check=True, capture_output=True, text=True).stdout
     outside, within, kept, afterwards, again = (int(number) for number in output.split())
-    assert outside > 4 * 9_000 and again > 4 * 9_000
+    assert min(outside, again) > 9_000  # 39 064, or fewer where the kernel hands out larger pages
     assert within < 1_000
     assert kept > 39e6
     assert afterwards < 5e6
