@@ -8,7 +8,6 @@ import mmap
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from itertools import count, cycle, islice
@@ -19,13 +18,13 @@ import psutil
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from benchmarks.interleave import Work, in_fresh_process, interleave
+from benchmarks.interleave import Work, in_fresh_process, interleave, keep_memory
 from benchmarks.networks import EPISODE, PAPER, NoiseFrames
 from benchmarks.report import Target, judged, spread
 from sb3_crc import FrameReplayBuffer
 from sb3_crc.augmentations import random_crop
 from sb3_crc.buffers.store import SLACK
-from sb3_crc.memory import available_memory, memory_kept
+from sb3_crc.memory import available_memory
 
 SIZES = (1_000, 10_000, 100_000)
 OURS, OPTIMIZED, STOCK = "FrameReplayBuffer", "SB3 optimize_memory_usage", "SB3"
@@ -45,8 +44,6 @@ FILL = 1.05
 #: kernel clears one of the 2 MB pages that SB3's arrays get
 BURST = 25
 
-#: What is entered once and left with the process; an object that nobody holds would leave at once
-PROCESS_LONG = ExitStack()
 #: After a buffer's name: that of the smallest size, timed beside it
 SMALLEST = ", smallest"
 TARGETS = [Target("add - copy us", 60), Target("growing add - copy us", 60), Target("sample ms", 8), Target("/ smallest", 1.5)]
@@ -273,7 +270,7 @@ def sampling(name: str, size: int, batch_size: int) -> Work:
     """:return: a batch with crops of o_t and o_{t+1}, with the allocator as :meth:`CRCSAC.learn` sets it, for all buffers"""
     buffer = filled(name, size)
     sample = buffer.sample_frames if isinstance(buffer, FrameReplayBuffer) else buffer.sample
-    PROCESS_LONG.enter_context(memory_kept())
+    keep_memory()
 
     def work() -> None:
         samples: Any = sample(batch_size)

@@ -6,8 +6,11 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from typing import Any
+
+from sb3_crc.memory import memory_kept
 
 Work = Callable[[], object]
 
@@ -58,6 +61,14 @@ def in_fresh_process(measure: Callable[[], Any]) -> Any:
     """:param measure: picklable; :return: what it returns, in a process that has done nothing before"""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(measure)
+
+
+def keep_memory() -> None:
+    """Set the allocator for the rest of this process as :meth:`~sb3_crc.CRCSAC.learn` sets it."""
+    _whole_process.enter_context(memory_kept())
+
+
+_whole_process = ExitStack()
 
 
 def _answer(pipe: Connection, name: str) -> float:

@@ -2,16 +2,14 @@
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from benchmarks.interleave import Work, in_fresh_process, interleave
+from benchmarks.interleave import Work, in_fresh_process, interleave, keep_memory
 from benchmarks.networks import PAPER, Networks
 from benchmarks.report import Target, judged, spread
 from benchmarks.update import count
-from sb3_crc.memory import memory_kept
 
 BATCH_SIZES = (64, 128, 256, 512)
 INPUT_SIZES = (64, 84, 100)
@@ -22,8 +20,6 @@ MARGIN = 16
 POLICY_DELAY = 2
 #: Time per sample of the largest batch, and per needed operation of any input, against those of the reference
 LARGEST_BATCH, ANY_INPUT = 1.0, 1.3
-#: What is entered once and left with the process; an object that nobody holds would leave at once
-PROCESS_LONG = ExitStack()
 
 
 def measure(
@@ -79,7 +75,7 @@ def update(networks: Networks, input_size: int, batch_size: int) -> Work:
     """
     resized = replace(networks, frame_size=input_size + MARGIN, input_size=input_size)
     model = resized.crc_sac("crc", batch_size, policy_delay=POLICY_DELAY, image_size=input_size)
-    PROCESS_LONG.enter_context(memory_kept())
+    keep_memory()
     return lambda: model.train(POLICY_DELAY, batch_size)
 
 

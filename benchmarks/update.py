@@ -6,11 +6,10 @@ from functools import partial
 from typing import Any
 
 from benchmarks.flops import matrix_peak, operations
-from benchmarks.interleave import Work, in_fresh_process, interleave
+from benchmarks.interleave import Work, in_fresh_process, interleave, keep_memory
 from benchmarks.networks import NETWORKS
 from benchmarks.peers import TextbookCRC, stock_sac
 from benchmarks.report import Target, judged, spread
-from sb3_crc.memory import memory_kept
 
 #: Name -> preset and what is changed of it
 OURS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -80,7 +79,7 @@ def ours(name: str, networks: str, batch_size: int, policy_delay: int) -> Work:
     """:return: ``policy_delay`` updates of CRCSAC, as within :meth:`learn`"""
     preset, changes = OURS[name]
     model = NETWORKS[networks].crc_sac(preset, batch_size, policy_delay=policy_delay, **changes)
-    memory_kept().__enter__()  # for the rest of this process
+    keep_memory()
     return lambda: model.train(policy_delay, batch_size)
 
 
@@ -88,7 +87,7 @@ def stock(networks: str, batch_size: int, policy_delay: int, *, equal: bool) -> 
     """:return: ``policy_delay`` updates of SB3's SAC; ``equal``: in our layout and with our allocator's settings"""
     model = stock_sac(NETWORKS[networks], batch_size, channels_last=equal)
     if equal:
-        memory_kept().__enter__()
+        keep_memory()
     return lambda: model.train(policy_delay, batch_size)
 
 
