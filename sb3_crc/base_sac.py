@@ -44,6 +44,9 @@ class BaseCRCSAC(SAC):
     _frame_channels: int | None = None
     _speedometer: Speedometer
 
+    def between_updates(self) -> None:
+        """Called before each update of :meth:`train`; a callback may put a function in its place, to stop there."""
+
     def _setup_model(self) -> None:
         self._speedometer = Speedometer()
         own = {name: getattr(self, name) for name in ("replay_buffer_class", "replay_buffer_kwargs", "n_steps")}
@@ -217,6 +220,7 @@ class BaseCRCSAC(SAC):
             "_collapse_alarm",
             "_speedometer",
             "_reads_next",
+            "between_updates",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -218,6 +218,7 @@ class CRCSAC(BaseCRCSAC):
 
         history = LossHistory(self._n_updates + 1, {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)})
         for _ in range(gradient_steps):
+            self.between_updates()
             self._n_updates += 1
             metrics = history.begin()
             views = self._sample_views(batch_size)

@@ -87,3 +87,26 @@ def test_a_killed_run_ends_as_it_would_have(tmp_path: Path) -> None:
 
     again = subprocess.run(resume, cwd=ROOT, env=environment(), capture_output=True, text=True)
     assert again.returncode == 1 and "has ended" in again.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_says_how_to_go_on(signum: int, tmp_path: Path) -> None:
+    flags = ["-n", "100000", "--eval-freq", "-1", "--verbose", "0", "--checkpoint-every", "40"]
+    run = subprocess.Popen(command(tmp_path, *flags), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
+    checkpoints = tmp_path / RUN / CHECKPOINTS
+    deadline = time.time() + 200
+    while not (checkpoints / "000000000080").exists():
+        assert run.poll() is None and time.time() < deadline
+        time.sleep(0.05)
+    run.send_signal(signum)
+    output, _ = run.communicate(timeout=100)
+    assert run.returncode == 128 + signum
+    last_line = output.strip().splitlines()[-1]
+    assert "To go on from the last checkpoint: " in last_line and last_line.endswith(f"--resume {tmp_path / RUN}")
+    stopped_at = int(last_line.partition("stopped at ")[2].split()[0])
+    assert (checkpoints / f"{stopped_at:012d}").exists()
+    go_on = last_line.partition("checkpoint: ")[2].split()
+    resumed = subprocess.run([*go_on, "-n", str(stopped_at + 5)], cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert resumed.returncode == 0, resumed.stderr[-2000:]
+    assert (checkpoints / f"{stopped_at + 5:012d}").exists()

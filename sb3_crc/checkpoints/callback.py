@@ -16,6 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.buffers.files import contents, read_contents
+from sb3_crc.checkpoints.signals import StopRequest, TrainingStopped
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
 from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
 
@@ -28,7 +29,10 @@ class TrainingCheckpoint(BaseCallback):
     and it ends as it would have without the interruption, bit for bit on a CPU with the same number of threads.
 
     Checkpoints are taken where a rollout starts, the only point at which environments, replay buffer, counters and networks
-    agree, and at the end; they are written beside the training. The file DONE tells that the training has ended.
+    agree, and at the end; they are written beside the training. The file DONE tells that the training has ended. SIGINT and
+    SIGTERM are such a point too: a checkpoint is saved, and :class:`~sb3_crc.checkpoints.signals.TrainingStopped`, a
+    KeyboardInterrupt, is raised. Where none comes within 5 seconds, training stops between two updates or steps, and the last
+    checkpoint is the one to go on from. A second signal ends the process at once.
 
     :param folder: of the checkpoints of this run
     :param every: agent steps between two checkpoints, rounded up to the next start of a rollout
@@ -50,6 +54,12 @@ class TrainingCheckpoint(BaseCallback):
         self._lock = FileLock(Path(folder) / LOCK)
         self._writer: ThreadPoolExecutor | None = None
         self._writing: Future[Path] | None = None
+        self._request = StopRequest()
+
+    @property
+    def stopped_by(self) -> int | None:
+        """The signal that asked for the end of this training; None: there was none."""
+        return self._request.signum
 
     def _init_callback(self) -> None:
         if not isinstance(getattr(self.model, "replay_buffer", None), FrameReplayBuffer):
@@ -62,6 +72,9 @@ class TrainingCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._writer = ThreadPoolExecutor(1, "checkpoint")
+        self._request = StopRequest()
+        self._request.listen()
+        self.model.between_updates = self._stop_if_overdue  # type: ignore[attr-defined]
         checkpoint = self.store.newest()
         if checkpoint is None:
             self._saved_at = self.model.num_timesteps
@@ -84,11 +97,21 @@ class TrainingCheckpoint(BaseCallback):
             print(f"Going on from {checkpoint.path}")
 
     def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self._saved_at >= self.every:
+        signum = self.stopped_by
+        if self.model.num_timesteps - self._saved_at >= (self.every if signum is None else 1):
             self._save()
+        if signum is not None:
+            self.close()
+            raise TrainingStopped(signum)
 
     def _on_step(self) -> bool:
+        self._stop_if_overdue()
         return True
+
+    def _stop_if_overdue(self) -> None:
+        if self._request.overdue and self.stopped_by is not None:
+            self.close()
+            raise TrainingStopped(self.stopped_by)
 
     def _on_training_end(self) -> None:
         if self._writer is None:  # rl_zoo3 calls this once more
@@ -102,7 +125,10 @@ class TrainingCheckpoint(BaseCallback):
         self.close()
 
     def close(self) -> None:
-        """Finish what is being written, and leave the folder to others; where training ends by itself, this is done."""
+        """Finish what is being written, and leave folder and signals to others; done where training ends by itself."""
+        self._request.ignore()
+        if hasattr(self, "model"):
+            vars(self.model).pop("between_updates", None)
         try:
             self._finish_writing()
         finally:

@@ -38,6 +38,8 @@ def train() -> None:
     except KeyboardInterrupt:
         say("Interrupted before or after training: what is in the run's folder is complete, nothing else was written.")
         sys.exit(130)
+    if CRCExperimentManager.stopped_by is not None:
+        sys.exit(128 + CRCExperimentManager.stopped_by)
 
 
 def enjoy(flags: Flags) -> None:

@@ -44,6 +44,8 @@ class CRCExperimentManager(ExperimentManager):
 
     #: Whether there are checkpoints, and whether a run goes on
     plan = Plan([], None, None)
+    #: The signal that ended the last training; None: there was none, or there were no checkpoints
+    stopped_by: int | None = None
 
     def __init__(self, args: Any, algo: str, *rest: Any, **kwargs: Any):
         own_config = CONFIGS / f"{algo}.yml"
@@ -111,6 +113,7 @@ class CRCExperimentManager(ExperimentManager):
             super().learn(model)
         finally:
             checkpoint.close()
+            type(self).stopped_by = checkpoint.stopped_by
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """Save the final model, draw the learning curve, film the best policy, and say how to go on."""

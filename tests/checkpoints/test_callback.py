@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
 from sb3_crc import CRCSAC, AuxiliaryLossCallback, FrameReplayBuffer, PixelEncoder, make_dmc
 from sb3_crc.checkpoints.callback import DONE, TrainingCheckpoint
+from sb3_crc.checkpoints.signals import TrainingStopped
 from sb3_crc.checkpoints.store import MANIFEST, CheckpointError, CheckpointStore
 from tests.conftest import POLICY_KWARGS, ClockEnv, NoiseEnv
 
@@ -89,6 +91,43 @@ def test_stopped_and_run_again_it_ends_the_same(stops: tuple[int, ...], whole: C
         assert not (tmp_path / DONE).exists()
     assert_equal(train(tmp_path, seed=9), whole)
     assert (tmp_path / DONE).read_text() == "60\n"
+
+
+class Signal(BaseCallback):
+    """Sends signals to this process."""
+
+    def __init__(self, signum: int, at: int):
+        super().__init__()
+        self.signum, self.at = signum, at
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            os.kill(os.getpid(), self.signum)
+        return True
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_stops(signum: int, whole: CRCSAC, tmp_path: Path) -> None:
+    before = signal.getsignal(signum)
+    model = CRCSAC("CnnPolicy", cartpole(0), seed=0, **SETTINGS)
+    with pytest.raises(TrainingStopped, match=signal.Signals(signum).name) as stop:
+        model.learn(STEPS, callback=[Signal(signum, 33), TrainingCheckpoint(tmp_path, every=10)])
+    assert isinstance(stop.value, KeyboardInterrupt)
+    assert CheckpointStore(tmp_path).names()[0] == "000000000033"  # not 30: nothing of what was done is lost
+    assert signal.getsignal(signum) is before
+    model = CRCSAC("CnnPolicy", cartpole(7), seed=7, **SETTINGS)
+    assert_equal(model.learn(STEPS, callback=[Signal(signum, 0), TrainingCheckpoint(tmp_path, every=10)]), whole)
+
+
+def test_a_signal_need_not_wait_for_long_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_crc.checkpoints.signals.GRACE", 0.2)
+    model = CRCSAC("CnnPolicy", cartpole(0), seed=0, **{**SETTINGS, "initial_updates": 100_000})
+    threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(TrainingStopped):
+        model.learn(STEPS, callback=TrainingCheckpoint(tmp_path, every=10))
+    assert 0 < model._n_updates < 100_000
+    assert CheckpointStore(tmp_path).names()[0] == "000000000020"  # the last one before those updates
+    TrainingCheckpoint(tmp_path)._take_lock()
 
 
 def test_it_costs_nothing_to_the_run(whole: CRCSAC, tmp_path: Path) -> None:
