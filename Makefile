@@ -17,8 +17,10 @@ help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
 	  printf '  make %-12s %s\n' "$$name" "$$text"; done
 
+# `set -m`: Ctrl-C reaches the training alone, not make, which would end with an error of its own.
 train: rendering ## train CRC-RL on cartpole-swingup from pixels; more flags: make train ARGS="--seed 1"
-	@exec .venv/bin/python train.py $(TRAIN_ARGS)
+	@set -m 2>/dev/null; .venv/bin/python train.py $(TRAIN_ARGS); status=$$?; \
+	case $$status in 130|143) ;; *) exit $$status ;; esac # stopped by a signal, and saved: no failure
 
 test: rendering ## the fast tests, a few minutes on two cores
 	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)

@@ -41,7 +41,7 @@ try:
 except KeyboardInterrupt:
     time.sleep(0.3)  # writing results
     print("go on with: -i logs/crc", flush=True)
-sys.exit(0)
+    sys.exit(130)
 """
 
 
@@ -143,7 +143,13 @@ def test_train_takes_more_flags(checkout: Checkout) -> None:
     assert training.endswith("--seed 3")
 
 
-def test_the_last_line_after_control_c_is_the_trainings(checkout: Checkout) -> None:
+@pytest.mark.parametrize(("status", "expected"), [(0, 0), (130, 0), (143, 0), (1, 2)])
+def test_only_a_training_that_saved_and_stopped_is_no_failure(checkout: Checkout, status: int, expected: int) -> None:
+    (checkout.path / "train.py").write_text(f"import sys; sys.exit({status})")
+    assert checkout.make("train").returncode == expected
+
+
+def test_control_c_ends_a_training_without_an_error_and_its_last_line_is_the_last(checkout: Checkout) -> None:
     import pty
 
     (checkout.path / "train.py").write_text(PATIENT_TRAINING)
@@ -163,6 +169,7 @@ def test_the_last_line_after_control_c_is_the_trainings(checkout: Checkout) -> N
         if b"training" in screen and not interrupted:
             os.write(terminal, b"\x03")
             interrupted = True
-    os.waitpid(process, 0)
+    _, status = os.waitpid(process, 0)
     os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 0
     assert screen.decode().endswith("go on with: -i logs/crc\r\n"), screen  # nothing from make after it
