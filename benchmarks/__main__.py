@@ -120,6 +120,29 @@ def scaling(repeats: Repeats = 10, output: Folder = RESULTS) -> None:
     publish("scaling", "An update of crc", rows, _command(), by=("varied",), folder=output)
 
 
+@app.command()
+def checkpoints(
+    decisions: Annotated[
+        int, typer.Option(min=1, help="Random decisions, of which every 1 000th is followed by a checkpoint.")
+    ] = 12_500,
+    buffer_size: Annotated[
+        int | None, typer.Option(min=1, help="Of the replay buffer; default: as many as decisions.")
+    ] = None,
+    networks: Annotated[list[str], typer.Option(help="paper, laptop")] = ["paper", "laptop"],  # noqa: B006
+    output: Folder = RESULTS,
+) -> None:
+    """How long TrainingCheckpoint stops a training, how long it writes, and what it needs on the disk."""
+    from benchmarks.checkpoints import EVERY, measure
+    from benchmarks.networks import NETWORKS
+
+    rows = []
+    with console.status("") as status:
+        for network in networks:
+            status.update(f"{network} networks")
+            rows.append(measure(networks=NETWORKS[network], decisions=decisions, buffer_size=buffer_size))
+    publish("checkpoints", f"A checkpoint after every {EVERY} decisions", rows, _command(), folder=output)
+
+
 @app.command("all")
 def everything(output: Folder = RESULTS) -> None:
     """All of these with their defaults, one after the other: two hours on two cores, which nothing else should use."""
@@ -128,6 +151,7 @@ def everything(output: Folder = RESULTS) -> None:
     env(output=output)
     end_to_end(output=output)
     scaling(output=output)
+    checkpoints(output=output)
 
 
 def _command() -> str:

@@ -28,6 +28,9 @@ from sb3_crc.buffers.replay import FrameReplayBuffer
 FORMAT = 1
 #: Frames in a full segment
 SEGMENT = 1024
+#: Share of a full segment below which the last one is written anew with what follows it: frequent saves would leave ever more
+#: small files otherwise, and rare ones would write frames twice
+SHORT = 1 / 4
 INDEX = "index.npz"
 
 
@@ -254,8 +257,8 @@ def _still_good(container: _Folder | _Archive, written: tuple[Segment, ...], fir
     starts_early = bool(segments) and segments[0].first <= first
     if not starts_early or not all(container.has(segment.name) for segment in segments):
         return []
-    if segments[-1].end - segments[-1].first < SEGMENT:
-        segments.pop()  # written anew with what follows it, or frequent saves would leave ever more small files
+    if segments[-1].end - segments[-1].first < SHORT * SEGMENT:
+        segments.pop()
     return segments
 
 
