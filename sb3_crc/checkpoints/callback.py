@@ -16,9 +16,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.buffers.files import contents, read_contents
+from sb3_crc.checkpoints.logs import distant_monitors, set_distant_monitors
 from sb3_crc.checkpoints.signals import StopRequest, TrainingStopped
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
 from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
+from sb3_crc.checkpoints.tree import Tree
 
 LOCK, OWNER, DONE = "lock", "owner.json", "DONE"
 
@@ -37,6 +39,8 @@ class TrainingCheckpoint(BaseCallback):
     :param folder: of the checkpoints of this run
     :param every: agent steps between two checkpoints, rounded up to the next start of a rollout
     :param keep: how many of the newest stay
+    :param monitor_dir: of :func:`~stable_baselines3.common.env_util.make_vec_env`, whose files would begin anew after an
+        interruption where environments live in other processes; in this process the files are found without it
     :param verbose: 1: say from where the training goes on
     :raises ValueError: for arguments that cannot work; when training starts, if another process uses the folder, if what is in
         it is damaged or does not fit the model, or if the model's replay buffer is not a FrameReplayBuffer
@@ -44,12 +48,20 @@ class TrainingCheckpoint(BaseCallback):
 
     model: OffPolicyAlgorithm
 
-    def __init__(self, folder: str | Path, every: int = 1_000, keep: int = 2, verbose: int = 0):
+    def __init__(
+        self,
+        folder: str | Path,
+        every: int = 1_000,
+        keep: int = 2,
+        monitor_dir: str | Path | None = None,
+        verbose: int = 0,
+    ):
         super().__init__(verbose)
         if every < 1:
             raise ValueError(f"every={every} must be at least 1")
         self.every = every
         self.store = CheckpointStore(Path(folder), keep)
+        self.monitor_dir = None if monitor_dir is None else Path(monitor_dir)
         self._saved_at = 0
         self._lock = FileLock(Path(folder) / LOCK)
         self._writer: ThreadPoolExecutor | None = None
@@ -123,6 +135,14 @@ class TrainingCheckpoint(BaseCallback):
             with atomic_write(self.store.folder / DONE) as unfinished:
                 unfinished.write_text(f"{self.model.num_timesteps}\n", encoding="utf-8")
         self.close()
+
+    def training_state(self) -> Tree:
+        """:return: files of Monitor that only ``monitor_dir`` leads to"""
+        return distant_monitors(self.training_env, self.monitor_dir)
+
+    def set_training_state(self, state: Tree) -> None:
+        """:param state: of :meth:`training_state`"""
+        set_distant_monitors(self.training_env, self.monitor_dir, state)
 
     def close(self) -> None:
         """Finish what is being written, and leave folder and signals to others; done where training ends by itself."""

@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Iterator
+from csv import DictReader, DictWriter
+from io import StringIO
 from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium as gym
 from stable_baselines3.common.logger import CSVOutputFormat, JSONOutputFormat, Logger
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
 from sb3_crc.checkpoints.tree import Tree, copied, is_plain
@@ -16,7 +18,8 @@ from sb3_crc.checkpoints.tree import Tree, copied, is_plain
 def log_state(logger: Logger, env: VecEnv) -> Tree:
     """
     :param logger: of the model; TensorBoard's files are not held: a new one is begun, whose steps overlap
-    :param env: of the training; Monitor's files are held where the environments live in this process
+    :param env: of the training; Monitor's files are held where the environments live in this process: for others see
+        :func:`distant_monitors`
     :return: what was recorded since the log was last written (figures and the like left out), and the files' contents
     """
     values = {name: value for name, value in logger.name_to_value.items() if is_plain(value)}
@@ -48,6 +51,61 @@ def set_log_state(logger: Logger, env: VecEnv, state: Tree) -> None:
     for monitor, text, seconds in zip(_monitors(env), state["monitors"], state["seconds"], strict=False):
         _write(monitor.results_writer.file_handler, text)
         monitor.t_start = time.time() - seconds
+
+
+def distant_monitors(env: VecEnv, folder: Path | None) -> Tree:
+    """
+    :param env: of the training
+    :param folder: ``monitor_dir`` of :func:`~stable_baselines3.common.env_util.make_vec_env`
+    :return: the files' contents where the environments live in other processes; None: otherwise, or without ``folder``
+    """
+    if folder is None or isinstance(env.unwrapped, DummyVecEnv):
+        return None
+    paths = [folder / f"{rank}.{Monitor.EXT}" for rank in range(env.num_envs)]
+    if not all(path.exists() for path in paths):
+        return None
+    starts = env.get_attr("t_start")
+    return {
+        "texts": [path.read_text(encoding="utf-8") for path in paths],
+        "seconds": [time.time() - start for start in starts],
+    }
+
+
+def set_distant_monitors(env: VecEnv, folder: Path | None, state: Tree) -> None:
+    """
+    :param env: of the training
+    :param folder: where the files go on
+    :param state: of :func:`distant_monitors`
+    """
+    if folder is None or state is None:
+        return
+    for rank, (text, seconds) in enumerate(zip(state["texts"], state["seconds"], strict=True)):
+        writer = ContinuedResults(folder / f"{rank}.{Monitor.EXT}", text)
+        env.env_method("set_wrapper_attr", "results_writer", writer, indices=rank)
+        env.env_method("set_wrapper_attr", "t_start", time.time() - seconds, indices=rank)
+
+
+class ContinuedResults(ResultsWriter):
+    """
+    Goes on with a file of Monitor's; it is opened in the process to which this is sent.
+
+    :param path: of the file
+    :param text: what it has held so far
+    """
+
+    def __init__(self, path: Path, text: str):
+        self.path, self.text = path, text
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _opened, (self.path, self.text)
+
+
+def _opened(path: Path, text: str) -> ContinuedResults:
+    writer = ContinuedResults(path, text)
+    writer.file_handler = path.open("w", encoding="utf-8", newline="\n")
+    writer.logger = DictWriter(writer.file_handler, DictReader(StringIO(text.partition("\n")[2])).fieldnames or [])
+    _write(writer.file_handler, text)
+    return writer
 
 
 def _formats(logger: Logger) -> Iterator[CSVOutputFormat | JSONOutputFormat]:

@@ -107,7 +107,7 @@ class CRCExperimentManager(ExperimentManager):
         run = Path(self.save_path)
         if self.plan.run is None:
             write_plan(self.plan, run)
-        checkpoint = TrainingCheckpoint(run / CHECKPOINTS, self.plan.checkpoint_every, verbose=1)
+        checkpoint = TrainingCheckpoint(run / CHECKPOINTS, self.plan.checkpoint_every, monitor_dir=run, verbose=1)
         self.callbacks.append(checkpoint)  # the last one: the others have started when it restores them
         try:
             super().learn(model)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ import pytest
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_crc import CRCSAC, AuxiliaryLossCallback, FrameReplayBuffer, PixelEncoder, make_dmc
 from sb3_crc.checkpoints.callback import DONE, TrainingCheckpoint
@@ -295,6 +298,37 @@ def test_files_of_the_log_go_on_where_the_checkpoint_was(tmp_path: Path) -> None
     whole, stopped = timeless(tmp_path / "whole"), timeless(tmp_path / "stopped")
     assert len(whole[0]) == 8 and len(whole[2]) == 5 and len(whole[3]["timesteps"]) == 4
     assert stopped == whole
+
+
+@pytest.mark.slow  # each process imports everything
+def test_environments_in_other_processes_go_on_with_their_files(tmp_path: Path) -> None:
+    def run(folder: Path, seed: int, stop: int | None) -> None:
+        env = make_vec_env(
+            partial(make_dmc, "cartpole-swingup", image_size=36, render_quality="fast", action_repeat=50),
+            n_envs=2,
+            seed=seed,
+            monitor_dir=str(folder),
+            vec_env_cls=SubprocVecEnv,
+        )
+        model = CRCSAC("CnnPolicy", env, seed=seed, **SETTINGS)
+        checkpoint = TrainingCheckpoint(folder / "checkpoints", every=10, monitor_dir=folder)
+        try:
+            model.learn(100, callback=[Stop(stop), checkpoint])
+        except StoppedError:
+            checkpoint.close()
+        env.close()
+
+    def episodes(folder: Path) -> list[list[str]]:
+        files = [(folder / f"{rank}.monitor.csv").read_text().splitlines() for rank in (0, 1)]
+        times = [[float(line.rsplit(",", 1)[1]) for line in lines[2:]] for lines in files]
+        assert all(own == sorted(own) for own in times)
+        return [[line.rsplit(",", 1)[0] for line in lines[1:]] for lines in files]
+
+    run(tmp_path / "whole", 0, None)
+    for seed, stop in ((0, 54), (4, 86), (5, None)):  # 54: each has ended one episode, which a new file would not show
+        run(tmp_path / "stopped", seed, stop)
+    assert [len(lines) for lines in episodes(tmp_path / "whole")] == [3, 3]
+    assert episodes(tmp_path / "stopped") == episodes(tmp_path / "whole")
 
 
 def test_bad_arguments_and_other_buffers_are_refused(tmp_path: Path) -> None:
