@@ -85,10 +85,11 @@ def make_model(env: gym.Env[Any, Any] | None = None, **kwargs: Any) -> CRCSAC:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow tests may take their time: the limit of the fast ones would fail them on a busy machine."""
+    """Slow and long tests may take their time: the limit of the fast ones would fail them on a busy machine."""
     for item in items:
-        if item.get_closest_marker("slow") is not None:
-            item.add_marker(pytest.mark.timeout(900))
+        for marker, seconds in (("slow", 900), ("long", 6 * 3600)):
+            if item.get_closest_marker(marker) is not None:
+                item.add_marker(pytest.mark.timeout(seconds))
 
 
 @pytest.fixture(autouse=True)

@@ -12,6 +12,8 @@ from sb3_crc.checkpoints.tree import Tree, copied, is_plain
 
 #: What SB3's Monitor keeps of the present episode and of those before
 MONITOR = ("rewards", "needs_reset", "episode_returns", "episode_lengths", "episode_times", "total_steps")
+#: Where a VecEnv keeps what its next reset is called with: evaluation environments may not have had one yet
+NEXT_RESET = ("_seeds", "_options")
 
 
 def vec_env_state(env: VecEnv) -> Tree:
@@ -30,6 +32,7 @@ def vec_env_state(env: VecEnv) -> Tree:
         "environments": env.env_method("get_state") if exact else None,
         "monitors": [copied(env.get_attr(name)) for name in MONITOR] if all(env.env_is_wrapped(Monitor)) else None,
         "action_space": env.action_space.np_random.bit_generator.state,
+        "next_reset": {name: copied(getattr(env, name)) for name in NEXT_RESET if is_plain(getattr(env, name))},
     }
 
 
@@ -48,6 +51,8 @@ def set_vec_env_state(env: VecEnv, state: Tree) -> bool:
     if isinstance(env, VecEnvWrapper):
         raise ValueError(f"{len(state['wrappers'])} wrappers were saved, this environment has more")
     env.action_space.np_random.bit_generator.state = state["action_space"]
+    for name, value in state["next_reset"].items():
+        setattr(env, name, copied(value))
     if state["environments"] is None:
         warnings.warn(
             "the environments have no get_state() and set_state(): the run goes on at the start of an episode, "

@@ -2,6 +2,7 @@
 
 import copy
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,16 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crc import CRCSAC, make_dmc
+from sb3_crc.checkpoints.environments import set_vec_env_state, vec_env_state
 from sb3_crc.checkpoints.training import set_training_state, training_state
 from sb3_crc.checkpoints.tree import copied, is_plain, read_tree, write_tree
-from tests.conftest import POLICY_KWARGS
+from tests.conftest import POLICY_KWARGS, NoiseEnv
 
 STEPS, MIDDLE = 60, 35
 
@@ -158,3 +162,24 @@ def test_what_is_no_plain_data_is_named(tmp_path: Path) -> None:
     assert not is_plain({"a": [object()]}) and not is_plain(np.array([None]))
     with pytest.raises(TypeError, match="/a/1 is object, which is no plain data"):
         write_tree({"a": [1, object()]}, tmp_path)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_seed_for_the_next_reset_is_part_of_the_state(exact: bool) -> None:
+    """Evaluation environments are often saved before their first episode."""
+
+    def environment(seed: int) -> VecEnv:
+        make = partial(make_dmc, "reacher-easy", seed=seed, image_size=36, render_quality="fast") if exact else NoiseEnv
+        return make_vec_env(make, seed=seed)
+
+    saved, other = environment(3), environment(4)
+    other.reset()
+    state = vec_env_state(saved)
+    if exact:
+        assert set_vec_env_state(other, state)
+    else:
+        with pytest.warns(UserWarning, match="no get_state"):
+            set_vec_env_state(other, state)
+    first = saved.reset()
+    assert np.array_equal(other.reset(), first)
+    assert not np.array_equal(environment(4).reset(), first)
