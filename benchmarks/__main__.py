@@ -121,6 +121,25 @@ def scaling(repeats: Repeats = 10, output: Folder = RESULTS) -> None:
 
 
 @app.command()
+def profile(
+    repeats: Annotated[int, typer.Option(min=1, help="Pairs of updates.")] = 5,
+    method: Annotated[str, typer.Option(help="A method of update.")] = "crc",
+    networks: Annotated[list[str], typer.Option(help="paper, laptop")] = ["paper", "laptop"],  # noqa: B006
+    batch: Annotated[int, typer.Option(min=2, help="Batch size.")] = 128,
+    output: Folder = RESULTS,
+) -> None:
+    """What an update spends its time on."""
+    from benchmarks.profiling import measure
+
+    rows = []
+    with console.status("") as status:
+        for network in networks:
+            status.update(f"{network} networks")
+            rows += [{"networks": network, **row} for row in measure(method, network, batch, repeats=repeats)]
+    publish("profile", f"An update of {method}, batch {batch}", rows, _command(), by=("networks",), folder=output)
+
+
+@app.command()
 def checkpoints(
     decisions: Annotated[
         int, typer.Option(min=1, help="Random decisions, of which every 1 000th is followed by a checkpoint.")
@@ -152,6 +171,7 @@ def everything(output: Folder = RESULTS) -> None:
     end_to_end(output=output)
     scaling(output=output)
     checkpoints(output=output)
+    profile(output=output)
 
 
 def _command() -> str:
