@@ -26,7 +26,7 @@ from sb3_crc import CRCSAC, TrainingCheckpoint, make_dmc
 from sb3_crc.checkpoints import store, tree
 from tests.conftest import POLICY_KWARGS
 
-STEPS, EVERY, BUFFER_SIZE = 360, 20, 150
+STEPS, EVERY, BUFFER_SIZE = 600, 20, 150
 #: What the writer calls, each once or several times for each checkpoint
 WRITER = {
     "frames": (np.lib.format, "write_array"),
