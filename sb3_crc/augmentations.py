@@ -128,6 +128,37 @@ def random_crop_overlay(
     return random_overlay(random_crop(images, size, last_offset=last_offset), alpha=alpha, source=source)
 
 
+def random_conv(images: th.Tensor) -> th.Tensor:
+    """
+    Recolour and blur each sample by a random 3x3 convolution, the same for each frame of its stack, and a sigmoid (SODA,
+    arXiv 2011.13389, after arXiv 1910.05396).
+
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :return: uint8 ``(B, C, H, W)``
+    :raises ValueError: for stacks that are not RGB
+    """
+    batch, channels, height, width = images.shape
+    if channels % 3 != 0:
+        raise ValueError(f"random_conv: needs stacks of RGB frames, got {channels} channels")
+    kernels = th.randn(3 * batch, 3, 3, 3).to(images.device)
+    frames = images.view(batch, channels // 3, 3, height, width).transpose(0, 1).flatten(1, 2) / 255  # (k, 3 B, H, W)
+    recoloured = F.conv2d(F.pad(frames, (1, 1, 1, 1), mode="replicate"), kernels, groups=batch).sigmoid_()
+    stacks = recoloured.view(-1, batch, 3, height, width).transpose(0, 1).reshape(images.shape)
+    return stacks.mul_(255).round_().to(th.uint8)
+
+
+def random_crop_conv(images: Images, size: ImageSize, *, last_offset: bool = True) -> th.Tensor:
+    """
+    :func:`random_crop`, then :func:`random_conv`.
+
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param size: as for :func:`random_crop`
+    :param last_offset: as for :func:`random_crop`
+    :return: uint8 ``(B, C, *size)``
+    """
+    return random_conv(random_crop(images, size, last_offset=last_offset))
+
+
 @lru_cache(maxsize=4)
 def _pictures(source: str | None, size: tuple[int, int]) -> th.Tensor:
     """:return: uint8 ``(pictures, 3, *size)``"""
@@ -159,10 +190,12 @@ AUGMENTATIONS: dict[str, Callable[..., th.Tensor]] = {
     "center_crop": center_crop,
     "random_shift": random_shift,
     "random_overlay": random_overlay,
+    "random_conv": random_conv,
     "random_crop_overlay": random_crop_overlay,
+    "random_crop_conv": random_crop_conv,
 }
 #: Those that take StoredImages; the others are given tensors
-CROPS = {"random_crop", "center_crop", "random_crop_overlay"}
+CROPS = {"random_crop", "center_crop", "random_crop_overlay", "random_crop_conv"}
 
 
 def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ...]) -> Callable[[Images], th.Tensor]:

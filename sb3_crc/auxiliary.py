@@ -153,9 +153,9 @@ class AuxiliaryLearner:
         loss = th.stack([self.weights[name] * value for name, value in losses.items()]).sum()
 
         encoder, objectives = (list(part.values()) for part in self._parameters.values())
-        leaves = views.anchor.leaves
+        leaves = views.query.leaves
         gradients = th.autograd.grad(loss, [*leaves, *objectives], allow_unused=True)
-        encoder_gradients = views.anchor.backward(gradients[: len(leaves)], encoder)
+        encoder_gradients = views.query.backward(gradients[: len(leaves)], encoder)
         for parameter, gradient in zip([*encoder, *objectives], [*encoder_gradients, *gradients[len(leaves) :]], strict=True):
             parameter.grad = gradient
         self.optimizer.step()

@@ -215,7 +215,8 @@ class BaseCRCSAC(SAC):
         return [
             *super()._excluded_save_params(),
             "_lr_schedules",
-            "_augmentation",
+            "_augment",
+            "_augment_query",
             "_objective_weights",
             "_collapse_alarm",
             "_speedometer",

@@ -3,7 +3,7 @@
 B batch, Z latent, A action.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -62,6 +62,9 @@ class CRCSAC(BaseCRCSAC):
     :param objectives: name -> weight, or name -> ``{"weight": w, **settings}``; ``{}``: no auxiliary losses
     :param augmentation: name in :data:`~sb3_crc.augmentations.AUGMENTATIONS`
     :param augmentation_kwargs: its arguments
+    :param objective_augmentation: as ``augmentation``, of what the objectives alone see of o_t instead of the view that critic
+        and actor see (SODA's strong view, arXiv 2011.13389); one more pass through the encoder. None: they see the same
+    :param objective_augmentation_kwargs: its arguments
     :param image_size: side of the network's input in pixels, or (height, width); None: 84 % of the frame for crops,
         the whole frame for other augmentations
     :param q_augmentations: M: the critic loss is averaged over so many augmentations of o_t (DrQ, arXiv 2004.13649, eq. 3)
@@ -101,6 +104,8 @@ class CRCSAC(BaseCRCSAC):
         objectives: ObjectiveSettings = PRESETS["crc"]["objectives"],
         augmentation: str = "random_crop",
         augmentation_kwargs: Mapping[str, Any] | None = None,
+        objective_augmentation: str | None = None,
+        objective_augmentation_kwargs: Mapping[str, Any] | None = None,
         image_size: ImageSize | None = None,
         q_augmentations: int = 1,
         target_augmentations: int = 1,
@@ -141,6 +146,8 @@ class CRCSAC(BaseCRCSAC):
         self.objectives = objectives
         self.augmentation = augmentation
         self.augmentation_kwargs = augmentation_kwargs
+        self.objective_augmentation = objective_augmentation
+        self.objective_augmentation_kwargs = objective_augmentation_kwargs
         self.image_size = image_size
         self.q_augmentations = q_augmentations
         self.target_augmentations = target_augmentations
@@ -163,6 +170,8 @@ class CRCSAC(BaseCRCSAC):
             raise ValueError(f"{refused}=True is not supported by {type(self).__name__}")
         shape = image_shape(image_space(self.observation_space))
         check_ranges(self)
+        if self.objective_augmentation is not None:
+            check_name("objective_augmentation", self.objective_augmentation, AUGMENTATIONS)
         for name, known in (("augmentation", tuple(AUGMENTATIONS)), ("anchor", ANCHORS), ("balance", BALANCES)):
             check_name(name, getattr(self, name), known)
         if self.joint_update and self.reencode:
@@ -185,14 +194,22 @@ class CRCSAC(BaseCRCSAC):
         self._reads_next = reads_next(self.policy.objectives, self.replay_buffer, self.n_steps)
 
         self._collapse_alarm = CollapseAlarm()
-        size = self.policy.critic.features_extractor.input_shape[1:]
-        sized = {"size": size} if takes_size(self.augmentation) else {}
-        augmentation_kwargs = {**sized, **(self.augmentation_kwargs or {})}
-        self._augmentation = bind_augmentation(self.augmentation, augmentation_kwargs, shape)
-        with th.random.fork_rng(devices=[]):
-            self._augment(th.zeros(1, *shape, dtype=th.uint8))
+        self._augment = self._to_input(self.augmentation, self.augmentation_kwargs, shape)
+        own = self.objective_augmentation
+        self._augment_query = None if own is None else self._to_input(own, self.objective_augmentation_kwargs, shape)
         if self.log_ent_coef is not None:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999))  # CURL's, as SAC+AE's
+
+    def _to_input(
+        self, augmentation: str, kwargs: Mapping[str, Any] | None, shape: tuple[int, ...]
+    ) -> Callable[[Images], th.Tensor]:
+        """:return: maps frames to augmented ones of the network's size; tried once, since frames may be too small"""
+        size = self.policy.critic.features_extractor.input_shape[1:]
+        sized = {"size": size} if takes_size(augmentation) else {}
+        augment = bind_augmentation(augmentation, {**sized, **(kwargs or {})}, shape)
+        with th.random.fork_rng(devices=[]):
+            center_crop(augment(th.zeros(1, *shape, dtype=th.uint8)), size)
+        return lambda images: center_crop(augment(images), size)
 
     def _network_input(self) -> ImageSize:
         if self.image_size is not None:
@@ -262,10 +279,8 @@ class CRCSAC(BaseCRCSAC):
             n_anchors=self.q_augmentations,
             n_bootstraps=self.target_augmentations,
             offers_next=self._reads_next,
+            augment_query=self._augment_query,
         )
-
-    def _augment(self, images: Images) -> th.Tensor:
-        return center_crop(self._augmentation(images), self.critic.features_extractor.input_shape[1:])
 
     def _update_critic_and_encoder(self, views: Views) -> dict[str, th.Tensor]:
         """
@@ -297,7 +312,7 @@ class CRCSAC(BaseCRCSAC):
         else:
             if not self.reencode:
                 critic_gradients = views.backward(td_gradients, encoder, retain_graph=True)
-            encoder_gradients = views.anchor.backward(auxiliary.leaves, encoder)
+            encoder_gradients = views.query.backward(auxiliary.leaves, encoder)
             if not self.reencode:
                 self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
             self._step(optimizer, [*encoder_gradients, *auxiliary.own])

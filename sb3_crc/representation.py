@@ -23,7 +23,7 @@ class AuxiliaryGradients:
     """
     Gradient of the weighted sum of the objectives.
 
-    :param leaves: at the anchor's latent ``(B, Z)`` and features ``(B, F)``; None where no objective depends on one
+    :param leaves: at the query's latent ``(B, Z)`` and features ``(B, F)``; None where no objective depends on one
     :param own: for each of the objectives' own parameters, in the order of ``objectives.parameters()``
     :param metrics: log key -> scalar
     """
@@ -58,7 +58,7 @@ def auxiliary_gradients(
     total = td_gradient.new_zeros(())
     for index, (name, objective) in enumerate(objectives.items()):
         loss = objective(views)
-        inputs = [*views.anchor.leaves, *objective.parameters()]
+        inputs = [*views.query.leaves, *objective.parameters()]
         gradients = th.autograd.grad(loss, inputs, allow_unused=True)
         at_latent = th.zeros_like(td_gradient) if gradients[0] is None else gradients[0]
         norm = at_latent.norm()

@@ -3,9 +3,12 @@
 ========== ============================= =========== ============== ===================================================
 view       what it is                    online      key encoder    who reads it
 ========== ============================= =========== ============== ===================================================
-anchor     augmented o_t                 yes, with   no             critic; actor (features detached); query of the
-                                         gradient                   contrastive loss; input and target of the
-                                                                    reconstruction; s of the consistency loss
+anchor     augmented o_t                 yes, with   no             critic; actor (features detached)
+                                         gradient
+query      the anchor; with another      yes, with   no             query of the contrastive loss; input and target of the
+           augmentation for the          gradient                   reconstruction; s of the consistency loss
+           objectives (``soda``), o_t
+           augmented by that
 positive   o_t, augmented anew           no          yes            key of the contrastive loss; s' of the consistency
                                                                     loss
 clean      the middle of o_t             no          yes            target of the consistency loss with its predictor
@@ -149,6 +152,7 @@ class Views:
     :param n_anchors: how many independent augmentations of o_t the critic is fitted on; the first is ``anchor``
     :param n_bootstraps: how many of o_{t+n} the Q targets are averaged over; the first is ``bootstrap``
     :param offers_next: an objective has declared that it reads ``next``
+    :param augment_query: as ``augment``, of what the objectives see of o_t instead of the anchor; None: the anchor
     """
 
     def __init__(
@@ -164,6 +168,7 @@ class Views:
         n_anchors: int = 1,
         n_bootstraps: int = 1,
         offers_next: bool = False,
+        augment_query: Callable[[Images], th.Tensor] | None = None,
     ):
         self._batch = batch
         self._augment = augment
@@ -174,6 +179,7 @@ class Views:
         self._n_anchors = n_anchors
         self._n_bootstraps = n_bootstraps
         self._offers_next = offers_next
+        self._augment_query = augment_query
         self.actions = batch.actions  # (B, A)
         self.rewards = batch.rewards * reward_scale  # (B, 1)
         discounts = gamma if batch.discounts is None else batch.discounts
@@ -187,8 +193,15 @@ class Views:
 
     @property
     def anchor(self) -> View:
-        """Augmented o_t, the one of ``anchors`` that the actor and the objectives see."""
+        """Augmented o_t, the one of ``anchors`` that the actor sees."""
         return self.anchors[0]
+
+    @cached_property
+    def query(self) -> View:
+        """What the objectives train the encoder through: the anchor, or o_t in an augmentation of their own."""
+        if self._augment_query is None:
+            return self.anchor
+        return self._view(self._batch.observations, self._augment_query, trains_encoder=True)
 
     @cached_property
     def positive(self) -> View:
@@ -233,22 +246,26 @@ class Views:
 
         :param td_gradients: at the latent of each of ``anchors``
         :param parameters: of the online encoder
-        :param leaves: of another loss at the leaves of ``anchor``, to carry on in the same pass
+        :param leaves: of another loss at the leaves of ``query``, to carry on in the same pass where that is the anchor
         :param retain_graph: keep the graph of ``anchor``'s encoding for another call
-        :return: the gradient for each parameter, summed over the anchors
+        :return: the gradient for each parameter, summed over the views
         """
+        passes = []
+        if self._augment_query is not None:
+            passes.append(self.query.backward(leaves, parameters))
+            leaves = (None, None)
         latent, features = leaves
         first = td_gradients[0] if latent is None else td_gradients[0] + latent
-        passes = [self.anchor.backward((first, features), parameters, retain_graph=retain_graph)]
+        passes.append(self.anchor.backward((first, features), parameters, retain_graph=retain_graph))
         for anchor, td_gradient in zip(self.anchors[1:], td_gradients[1:], strict=True):
             passes.append(anchor.backward((td_gradient, None), parameters))
         by_parameter = (list(filter(th.is_tensor, gradients)) for gradients in zip(*passes, strict=True))
         return [reduce(th.add, gradients) if gradients else None for gradients in by_parameter]
 
     def forget_encodings(self) -> None:
-        """Encode the anchors anew when they are read next, by the weights of then."""
-        for anchor in self.anchors:
-            anchor.forget_encoding()
+        """Encode what trains the encoder anew when it is read next, by the weights of then."""
+        for view in (*self.anchors, self.query):
+            view.forget_encoding()
 
     def _view(self, observations: Any, augment: Callable[[Images], th.Tensor], *, trains_encoder: bool = False) -> View:
         images, proprioception = split_observations(observations, self._observation_space)

@@ -2,8 +2,9 @@
 
 import pytest
 import torch as th
+from torch.nn import functional as F
 
-from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_crop, random_shift, takes_size
+from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_conv, random_crop, random_shift, takes_size
 
 
 def coordinates(batch: int, size: int) -> th.Tensor:
@@ -54,9 +55,25 @@ def test_contract_of_the_registry(name: str) -> None:
     assert th.equal(images, before), "the sampled batch must not be changed in place"
 
 
+def test_random_conv_recolours_each_frame_of_a_stack_alike() -> None:
+    frames = th.randint(0, 256, (6, 3, 10, 12), dtype=th.uint8)
+    images = frames.repeat(1, 3, 1, 1)  # stacks of three equal frames
+    th.manual_seed(0)
+    recoloured = random_conv(images)
+    th.manual_seed(0)
+    kernels = th.randn(18, 3, 3, 3).view(6, 3, 3, 3, 3)
+    for image, frame, kernel in zip(recoloured, frames, kernels, strict=True):
+        padded = F.pad(frame[None] / 255, (1, 1, 1, 1), mode="replicate")
+        expected = (255 * F.conv2d(padded, kernel).sigmoid()).round()
+        for index in range(3):
+            assert th.allclose(image[3 * index : 3 * index + 3].float(), expected[0], atol=1)  # a level of rounding
+    with pytest.raises(ValueError, match="RGB frames, got 4"):
+        random_conv(coordinates(2, 9))
+
+
 def test_augmentations_are_reproducible_from_torchs_seed() -> None:
     images = th.randint(0, 256, (32, 3, 20, 20), dtype=th.uint8)
-    for augment in (lambda: random_crop(images, 12), lambda: random_shift(images)):
+    for augment in (lambda: random_crop(images, 12), lambda: random_shift(images), lambda: random_conv(images)):
         th.manual_seed(1)
         first = augment()
         assert not th.equal(first, augment())

@@ -201,17 +201,17 @@ class Latents:
 
     def __init__(self, batch: int = 8, dim: int = 16):
         rows = [th.randn(batch, dim) for _ in range(3)]
-        self.anchor, self.positive, self.clean = (type("V", (), {"latent": row, "key_latent": row + 1}) for row in rows)
+        self.query, self.positive, self.clean = (type("V", (), {"latent": row, "key_latent": row + 1}) for row in rows)
 
 
 def test_reconstruction_of_quantised_pixels() -> None:
     views = Latents()
-    views.anchor.images = th.randint(0, 256, (8, *SHAPE), dtype=th.uint8)
+    views.query.images = th.randint(0, 256, (8, *SHAPE), dtype=th.uint8)
     objective = Reconstruction(16, SHAPE, 2, channels=(8,), strides=(2,), bits=5, latent_penalty=0, decoder_penalty=0)
     th.manual_seed(0)
     loss = objective(views)
     th.manual_seed(0)
-    expected = F.mse_loss(objective.decoder(views.anchor.latent), quantize(views.anchor.images, 5))
+    expected = F.mse_loss(objective.decoder(views.query.latent), quantize(views.query.images, 5))
     assert loss.item() == pytest.approx(expected.item())
 
 
@@ -222,9 +222,13 @@ def test_consistency_of_the_released_code() -> None:
     )
     names = [type(layer).__name__ for layer in objective.predictor]
     assert names == ["Linear", "BatchNorm1d", "ReLU", "Linear", "BatchNorm1d", "ReLU", "Linear"]
-    predicted = objective.predictor(views.anchor.latent)
-    cosine = F.cosine_similarity(predicted, views.clean.key_latent, dim=1)
-    assert objective(views).item() == pytest.approx(((2 - 2 * cosine) / 16).mean().item(), rel=1e-4)  # |a-b|^2 of unit vectors
+    predicted = objective.predictor(views.query.latent)
+    for target in ("clean", "positive"):
+        objective.target = target
+        cosine = F.cosine_similarity(predicted, getattr(views, target).key_latent, dim=1)
+        assert objective(views).item() == pytest.approx(
+            ((2 - 2 * cosine) / 16).mean().item(), rel=1e-4
+        )  # |a-b|^2, unit vectors
 
 
 def test_batch_norm_statistics_are_learned_and_saved(tmp_path: Any) -> None:

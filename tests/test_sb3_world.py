@@ -29,7 +29,7 @@ from sb3_crc import CRCSAC, PRESETS, CRCPolicy, PixelEncoder
 from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 ROOT = Path(__file__).parent.parent
-SMALL = ("batch_size", "buffer_size", "learning_starts")  # what make_model decides
+SMALL = ("batch_size", "buffer_size", "learning_starts", "initial_updates")  # what would take long
 FORMS: dict[str, dict[str, Any]] = {
     **{
         name: {

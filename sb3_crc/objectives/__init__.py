@@ -73,7 +73,12 @@ def build_objectives(objectives: ObjectiveSettings, encoder: PixelEncoder, actio
     :raises ValueError: for an unknown name or setting, or a bad weight
     """
     weights = objective_weights(objectives)
-    if set(weights) == {"consistency"}:
+    online = [
+        setting
+        for setting in objectives.values()
+        if isinstance(setting, Mapping) and setting.get("predictor_side") == "online"
+    ]
+    if set(weights) == {"consistency"} and not online:  # SODA's form holds its target still
         warnings.warn("consistency is the only objective: without another one it collapses the latent", stacklevel=2)
     if set(weights) == set(OBJECTIVES) and not math.isclose(sum(weights.values()), 1, abs_tol=1e-2):
         warnings.warn(f"the weights of CRC-RL's three losses should sum to 1 (the paper), got {weights}", stacklevel=2)

@@ -14,6 +14,7 @@ from sb3_crc.views import Views
 
 REDUCTIONS = ("sum", "mean")
 SIDES = ("key", "online")
+TARGETS = ("clean", "positive")
 PREDICTORS = ("layer_norm", "batch_norm")
 
 
@@ -38,7 +39,9 @@ class Consistency(AuxiliaryObjective):
 
     :param predictor_side: ``"key"``: h(s') predicts s, as the paper writes: from the key encoder's latent of the positive the
         online latent of the anchor, through which alone the encoder receives gradient; ``"online"``: h(s) predicts
-        the key encoder's latent of the clean view, as the released code does (and SODA, arXiv 2011.13389)
+        the key encoder's latent of ``target``, as the released code does (and SODA, arXiv 2011.13389)
+    :param target: with the predictor on the online side: ``"clean"``, the middle of the frame (the released code), or
+        ``"positive"``, which is augmented like what the critic sees (SODA)
     :param predictor: ``"layer_norm"``: Linear, LayerNorm, ReLU, Linear; ``"batch_norm"``: Linear, BatchNorm, ReLU twice, then
         Linear (the released code)
     :param hidden_dim: width of the predictor
@@ -53,6 +56,7 @@ class Consistency(AuxiliaryObjective):
         action_dim: int,
         *,
         predictor_side: str = "key",
+        target: str = "clean",
         predictor: str = "layer_norm",
         hidden_dim: int = 128,
         normalize: bool = False,
@@ -60,9 +64,11 @@ class Consistency(AuxiliaryObjective):
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
         check_name("consistency: predictor_side", predictor_side, SIDES)
+        check_name("consistency: target", target, TARGETS)
         check_name("consistency: predictor", predictor, PREDICTORS)
         check_name("consistency: reduction", reduction, REDUCTIONS)
         self.predictor_side = predictor_side
+        self.target = target
         self.normalize = normalize
         self.reduction = reduction
         norm, hidden_layers = (nn.LayerNorm, 1) if predictor == "layer_norm" else (nn.BatchNorm1d, 2)
@@ -74,9 +80,9 @@ class Consistency(AuxiliaryObjective):
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
         if self.predictor_side == "key":
-            predicted, target = self.predictor(views.positive.key_latent), views.anchor.latent
+            predicted, target = self.predictor(views.positive.key_latent), views.query.latent
         else:
-            predicted, target = self.predictor(views.anchor.latent), views.clean.key_latent
+            predicted, target = self.predictor(views.query.latent), getattr(views, self.target).key_latent
         if self.normalize:
             predicted, target = F.normalize(predicted, dim=1), F.normalize(target, dim=1)
         return consistency_loss(predicted, target, self.reduction)

@@ -72,7 +72,7 @@ class Contrastive(AuxiliaryObjective):
         :return: the loss, a scalar; ``metrics`` then hold the share of queries whose own key scores best, and log B minus the
             loss, a lower bound of the mutual information in nats (arXiv 1807.03748)
         """
-        logits = _logits(views.anchor.latent, getattr(views, self.key).key_latent, self.bilinear)
+        logits = _logits(views.query.latent, getattr(views, self.key).key_latent, self.bilinear)
         loss = _cross_entropy(logits)
         correct = logits.detach().argmax(dim=1) == th.arange(len(logits), device=logits.device)
         self.metrics = {"accuracy": correct.float().mean(), "information": math.log(len(logits)) - loss.detach()}

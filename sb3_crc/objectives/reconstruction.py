@@ -144,8 +144,8 @@ class Reconstruction(AuxiliaryObjective):
 
     def forward(self, views: Views) -> th.Tensor:
         """:param views: the views of one batch; :return: the loss, a scalar"""
-        latent = views.anchor.latent
-        loss = reconstruction_loss(self.decoder(latent), self._target(getattr(views, self.target)), self.reduction)
+        latent, view = views.query.latent, views.query if self.target == "anchor" else views.clean
+        loss = reconstruction_loss(self.decoder(latent), self._target(view), self.reduction)
         if self.latent_penalty > 0:
             loss = loss + self.latent_penalty * latent.square().sum(dim=1).mean() / 2
         if self.decoder_penalty > 0:
