@@ -1,25 +1,18 @@
 """Tables for people and JSON for later: every figure with its spread, its target and the machine that it was measured on."""
 
 import json
-import os
-import platform
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import psutil
-import torch as th
 from rich.console import Console
 from rich.table import Table
 
-import sb3_crc
+from sb3_crc.experiments.provenance import provenance
 
 RESULTS = Path(__file__).parents[1] / "results" / "benchmarks"
-PACKAGES = ("torch", "numpy", "stable-baselines3", "gymnasium", "dm-control", "mujoco", "shimmy")
 
 
 @dataclass(frozen=True)
@@ -78,7 +71,7 @@ def publish(
         print_table(heading, [row for row in rows if tuple(row[column] for column in by) == values], hidden=by)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    path.write_text(json.dumps({"command": command, **machine(), "rows": list(rows)}, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps({"command": command, **provenance(), "rows": list(rows)}, indent=1) + "\n", encoding="utf-8")
     return path
 
 
@@ -97,30 +90,6 @@ def print_table(title: str, rows: Sequence[dict[str, Any]], hidden: Sequence[str
         verdicts = row.get("targets", {})
         table.add_row(*(_cell(row.get(column), verdicts.get(column, "")) for column in columns))
     Console(width=Console(width=1_000).measure(table).maximum).print(table)  # a terminal may wrap it, columns never shrink
-
-
-def machine() -> dict[str, Any]:
-    """:return: when and on what this runs"""
-    return {
-        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": {
-            "processor": _processor(),
-            "cores": os.cpu_count(),
-            "threads": th.get_num_threads(),
-            "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-            "system": platform.platform(),
-        },
-        "versions": {"python": platform.python_version(), "sb3_crc": sb3_crc.__version__}
-        | {package: version(package) for package in PACKAGES},
-    }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 def _cell(value: Any, verdict: str) -> str:

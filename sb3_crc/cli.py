@@ -1,4 +1,7 @@
-"""The command line, ``python -m sb3_crc``: what works here, and small measurements. Training is ``train.py``."""
+"""The command line, ``sb3-crc`` or ``python -m sb3_crc``: what works here, measurements, comparisons.
+
+Training is ``train.py``.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sb3_crc.experiments.commands import app as experiments
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="CRC-RL for Stable-Baselines3.")
+app.add_typer(experiments)
 console = Console()
 errors = Console(stderr=True)
 

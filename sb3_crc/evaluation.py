@@ -4,6 +4,7 @@ T length of an episode in agent steps, A action.
 """
 
 import io
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,10 @@ from sb3_crc.crc_sac import CRCSAC
 
 Observation = np.ndarray | dict[str, np.ndarray]
 
+#: Evaluation k of every run begins with this seed plus k times the step; far from the seeds of trainings, and from those of
+#: experiments/final.py
+FIRST_SEED, SEED_STEP = 20_000, 100
+
 
 class QBiasEvalCallback(EvalCallback):
     """
@@ -27,26 +32,73 @@ class QBiasEvalCallback(EvalCallback):
     gamma^t (r_t - alpha log pi(a|s_t)), and where the time limit ended the episode
     gamma^T (min Q(s_T, a) - alpha log pi(a|s_T)), with actions a drawn from the policy (Haarnoja et al. 2018,
     arXiv 1812.05905, eq. 3). The evaluation itself acts by the policy's mean, so even a perfect critic shows a small bias; a
-    growing one is overestimation. Rewards count with ``reward_scale``. Arguments are EvalCallback's; for other algorithms it
-    is EvalCallback.
+    growing one is overestimation. Rewards count with ``reward_scale``. Arguments are EvalCallback's; for other algorithms
+    nothing of this is logged.
+
+    For every algorithm the k-th evaluation begins with the same seed, so that methods and seeds meet the same initial states;
+    and ``evaluations.npz`` also holds ``seeds``, ``updates`` (gradient steps) and ``seconds`` of training, without
+    evaluations, at each of them, and ``training_seconds`` in all.
     """
 
     def _init_callback(self) -> None:
         super()._init_callback()
         self._episodes: dict[int, list[tuple[Observation, np.ndarray, float]]] = {}
         self._biases: list[tuple[float, float]] = []
+        self.evaluations_seeds: list[int] = []
+        self.evaluations_updates: list[int] = []
+        self.evaluations_seconds: list[float] = []
+        self._trained, self._since = 0.0, time.perf_counter()
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._since = time.perf_counter()
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        self._stop_clock()
+        if self.log_path is not None:
+            self._write_evaluations()
+
+    def training_state(self) -> dict[str, float]:
+        """:return: what a checkpoint keeps beside the plain attributes: seconds of training until now"""
+        self._stop_clock()
+        return {"seconds": self._trained}
+
+    def set_training_state(self, state: dict[str, float]) -> None:
+        """:param state: of :meth:`training_state`"""
+        self._trained, self._since = state["seconds"], time.perf_counter()
+
+    def _stop_clock(self) -> None:
+        now = time.perf_counter()
+        self._trained, self._since = self._trained + now - self._since, now
 
     def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return super()._on_step()
+        self._stop_clock()
+        seed = FIRST_SEED + SEED_STEP * (self.n_calls // self.eval_freq)
+        self.eval_env.seed(seed)
+        try:
+            return self._evaluate(seed)
+        finally:
+            self._since = time.perf_counter()
+
+    def _evaluate(self, seed: int) -> bool:
         self._biases = []
         self._episodes = {}
-        if self.log_path is None or self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+        if self.log_path is None:
             return super()._on_step()
+        done = len(self.evaluations_length)
         # SB3's own writing, which Ctrl-C may cut short, goes nowhere; what is evaluated by then is written whole
         log_path, self.log_path = self.log_path, io.BytesIO()  # type: ignore[assignment]
         try:
             return super()._on_step()
         finally:
             self.log_path = log_path
+            if len(self.evaluations_length) > done:
+                self.evaluations_seeds.append(seed)
+                self.evaluations_updates.append(getattr(self.model, "_n_updates", 0))
+                self.evaluations_seconds.append(self._trained)
             self._write_evaluations()
 
     def _write_evaluations(self) -> None:
@@ -59,6 +111,10 @@ class QBiasEvalCallback(EvalCallback):
         arrays = {name: np.array(values[:complete]) for name, values in records.items()}
         if self.evaluations_successes:
             arrays["successes"] = np.array(self.evaluations_successes)
+        for name in ("seeds", "updates", "seconds"):
+            if len(values := getattr(self, f"evaluations_{name}")) == complete:  # not if an older checkpoint knew of none
+                arrays[name] = np.array(values)
+        arrays["training_seconds"] = np.array(self._trained)
         if complete > 0:
             with atomic_write(Path(f"{self.log_path}.npz")) as unfinished, unfinished.open("wb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -1,5 +1,7 @@
 """Is the Q bias that is logged the one that is defined?"""
 
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,7 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import KVWriter, Logger
 
-from sb3_crc.evaluation import QBiasEvalCallback, q_value_and_soft_return
+from sb3_crc.evaluation import FIRST_SEED, SEED_STEP, QBiasEvalCallback, q_value_and_soft_return
 from tests.conftest import ClockEnv, NoiseEnv, make_model
 
 OPTIMUM = {False: 10.0, True: 1 + 0.9 + 0.81 + 0.729 + 0.6561}
@@ -81,3 +83,51 @@ def test_other_algorithms_are_evaluated_as_ever() -> None:
     model.learn(20, callback=callback)
     assert np.isfinite(callback.last_mean_reward)
     assert "eval/q_bias" not in model.logger.name_to_value
+
+
+class SeededEnv(NoiseEnv):
+    """Keeps the seeds with which it was reset, and dawdles while it is stepped."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        super().__init__()
+        self.seeds: list[int] = []
+        self.seconds = seconds
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.seeds += [] if seed is None else [seed]
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        time.sleep(self.seconds)
+        return super().step(action)
+
+
+def test_evaluations_of_all_runs_begin_with_the_same_seeds(tmp_path: Path) -> None:
+    seeds = []
+    for seed, learning_starts in ((0, 15), (1, 100)):
+        env = SeededEnv()
+        model = make_model(NoiseEnv(), seed=seed, learning_starts=learning_starts)
+        before = model._n_updates
+        callback = QBiasEvalCallback(
+            env, eval_freq=10, n_eval_episodes=2, verbose=0, warn=False, log_path=str(tmp_path / str(seed))
+        )
+        model.learn(30, callback=callback)
+        seeds.append(env.seeds)
+        with np.load(tmp_path / str(seed) / "evaluations.npz") as data:
+            assert data["seeds"].tolist() == env.seeds
+            assert data["updates"].tolist() == [before + max(0, steps - learning_starts) for steps in (9, 19, 29)]
+    assert seeds[0] == seeds[1] == [FIRST_SEED + SEED_STEP, FIRST_SEED + 2 * SEED_STEP, FIRST_SEED + 3 * SEED_STEP]
+
+
+def test_seconds_are_those_of_training_alone(tmp_path: Path) -> None:
+    model = make_model(NoiseEnv(), learning_starts=100)
+    callback = QBiasEvalCallback(SeededEnv(0.1), eval_freq=5, n_eval_episodes=2, verbose=0, warn=False, log_path=str(tmp_path))
+    begin = time.perf_counter()
+    model.learn(10, callback=callback)
+    elapsed = time.perf_counter() - begin
+    with np.load(tmp_path / "evaluations.npz") as data:
+        evaluating = 0.1 * data["ep_lengths"].sum()
+        assert 0 < data["seconds"][0] < data["seconds"][1] <= data["training_seconds"] < elapsed - evaluating
+    state = callback.training_state()
+    callback.set_training_state({"seconds": 100.0})
+    assert state["seconds"] < 100 < callback.training_state()["seconds"] < 101

@@ -47,6 +47,9 @@ def test_what_cannot_go_on_is_said_in_one_line(tmp_path: Path, capsys: pytest.Ca
         assert message in capsys.readouterr().err
     write_plan(Plan([], 50, None), tmp_path)
     (tmp_path / CHECKPOINTS / "DONE").write_text("100\n")
+    (tmp_path / "best_model.zip").touch()
+    assert read_plan(["--resume", str(tmp_path)]).run == tmp_path, "killed before its final model was saved"
+    (tmp_path / "dmc_pixels-cartpole-swingup-v0.zip").touch()
     with pytest.raises(SystemExit, match="has ended; to prolong it, add -n"):
         read_plan(["--resume", str(tmp_path)])
     assert read_plan(["--resume", str(tmp_path), "-n", "200"]).run == tmp_path
@@ -58,7 +61,7 @@ def results(folder: Path) -> tuple[Any, ...]:
         progress = [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
     monitor = [line.rsplit(",", 1)[0] for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
     with np.load(folder / "evaluations.npz") as data:
-        evaluations = {name: data[name].tolist() for name in data.files}
+        evaluations = {name: data[name].tolist() for name in data.files if "seconds" not in name}
     return progress, monitor, evaluations
 
 

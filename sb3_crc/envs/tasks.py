@@ -84,6 +84,11 @@ def environment_id(task: str) -> str:
     return f"{NAMESPACE}/{task}-v0"
 
 
+def task_of(env_id: str) -> str:
+    """:param env_id: of Gymnasium; :return: "domain-task" for ids of :func:`environment_id`, the id itself for any other"""
+    return env_id.removeprefix(f"{NAMESPACE}/").removesuffix("-v0") if env_id.startswith(f"{NAMESPACE}/") else env_id
+
+
 def split_task(task: str) -> tuple[str, str]:
     """Split a task's name into the suite's domain and task.
 

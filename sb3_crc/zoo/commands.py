@@ -16,6 +16,7 @@ import rl_zoo3.utils
 from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
+from sb3_crc.stock import STOCK
 from sb3_crc.zoo.algorithms import preset_class, register, watched
 from sb3_crc.zoo.figures import figures, normalized_inputs, split_figures_flag
 from sb3_crc.zoo.manager import CRCExperimentManager
@@ -117,8 +118,8 @@ def _run(command: str, flags: Flags, script: Callable[[], Any]) -> None:
 
 def _register_watched() -> None:
     register()
-    for name in PRESETS:
-        rl_zoo3.ALGOS[name] = watched(preset_class(name))
+    for name, algorithm in {**STOCK, **{preset: preset_class(preset) for preset in PRESETS}}.items():
+        rl_zoo3.ALGOS[name] = watched(algorithm)
 
 
 def _why_no_window(flags: Flags) -> str | None:

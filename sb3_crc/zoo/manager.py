@@ -1,11 +1,12 @@
 """One run, or one search, of the zoo."""
 
-import copy
 import importlib.util
 import logging
 import os
 import shlex
 import sys
+from collections import OrderedDict
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,16 +24,19 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
+from sb3_crc.configurations import configuration_file, settings_for
+from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.curves import plot_learning_curve
+from sb3_crc.experiments.provenance import provenance
+from sb3_crc.experiments.runs import PROVENANCE, write_json
 from sb3_crc.presets import PRESETS
-from sb3_crc.settings import check_name
+from sb3_crc.stock import STOCK
 from sb3_crc.zoo.messages import say
 from sb3_crc.zoo.resume import CHECKPOINTS, Plan, write_plan
 from sb3_crc.zoo.search import ARGUMENTS, constructor_arguments, sample
 
 logger = logging.getLogger(__name__)
 
-CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
 SQLITE = "sqlite:///"
 
 
@@ -47,11 +51,13 @@ class CRCExperimentManager(ExperimentManager):
     #: The signal that ended the last training; None: there was none, or there were no checkpoints
     stopped_by: int | None = None
 
-    def __init__(self, args: Any, algo: str, *rest: Any, **kwargs: Any):
-        own_config = CONFIGS / f"{algo}.yml"
-        if kwargs.get("config") is None and own_config.exists():
+    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any):
+        own_config = configuration_file(algo)
+        # rl_zoo3 has a sac.yml too, for environments of states
+        ours = algo not in STOCK or env_id.startswith(f"{NAMESPACE}/")
+        if kwargs.get("config") is None and own_config.exists() and ours:
             kwargs["config"] = str(own_config)
-        super().__init__(args, algo, *rest, **kwargs)
+        super().__init__(args, algo, env_id, *rest, **kwargs)
         if self.plan.run is not None:
             self.save_path = str(self.plan.run)
             self.params_path = str(self.plan.run / str(self.env_name))
@@ -62,28 +68,25 @@ class CRCExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
-        As in the zoo, but a configuration may hold ``presets: {crc: {...}, ...}``: what one preset has beside the rest; and
+        As in the zoo, but a configuration may be for several algorithms (:func:`~sb3_crc.configurations.settings_for`); and
         the trial of ``--trial-id`` (which may be 0) replaces what it drew and nothing else.
 
         :return: two mappings of the same content: one to be consumed, one to be saved
         :raises ValueError: for an unknown preset
         """
         trial_id, self.trial_id = self.trial_id, None
-        consumed, saved = super().read_hyperparameters()
-        for hyperparams in (consumed, saved):
-            own = hyperparams.pop("presets", {})
-            for name in own:
-                check_name("preset", name, PRESETS)
-            hyperparams.update({**own.get(self.algo, {}), **(self.custom_hyperparams or {})})
-        if trial_id is not None and self.storage and self.study_name and self.algo in PRESETS:
-            parameters = self.load_trial(self.storage, self.study_name, trial_id, convert=False)
-            drawn = constructor_arguments({**PRESETS[self.algo], **saved}, parameters)
-            drawn = {name: value for name, value in drawn.items() if name not in (self.custom_hyperparams or {})}
+        read, _ = super().read_hyperparameters()
+        given = self.custom_hyperparams or {}
+        settings = {**settings_for(self.algo, read), **given}
+        if trial_id is not None and self.storage and self.study_name:
+            drawn = self.load_trial(self.storage, self.study_name, trial_id, convert=self.algo not in PRESETS)
+            if self.algo in PRESETS:
+                drawn = constructor_arguments({**PRESETS[self.algo], **settings}, drawn)
+            drawn = {name: value for name, value in drawn.items() if name not in given}
             say(f"Trial {trial_id} of {self.study_name}: {drawn}")
-            consumed.update(drawn)
-            saved.update(drawn)
-        self._configuration = copy.deepcopy(dict(saved))
-        return consumed, saved
+            settings |= drawn
+        self._configuration = deepcopy(settings)
+        return settings, OrderedDict(sorted(deepcopy(settings).items()))
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if "ParallelTrainCallback" in str(hyperparams.get("callback")):
@@ -101,6 +104,8 @@ class CRCExperimentManager(ExperimentManager):
     def learn(self, model: BaseAlgorithm) -> None:
         """Train until done or interrupted (Ctrl-C), logging to ``progress.csv`` and TensorBoard."""
         model.set_logger(self._make_logger(model))
+        if self.plan.run is None:
+            write_json(provenance(), Path(self.save_path) / PROVENANCE)
         if self.plan.checkpoint_every is None:
             super().learn(model)
             return
@@ -180,6 +185,10 @@ class CRCExperimentManager(ExperimentManager):
 
     def hyperparameters_optimization(self) -> None:
         """As in the zoo; the best trial is also written as a configuration that ``--conf-file`` takes."""
+        if self.algo not in rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER:
+            raise ValueError(
+                f"-optimize draws nothing for {self.algo!r}: search for the settings of a method of ours, and give it those"
+            )
         if self.algo in PRESETS:
             configuration = {**PRESETS[self.algo], **self._hyperparams}
             rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER[self.algo] = partial(sample, configuration)
@@ -197,11 +206,14 @@ class CRCExperimentManager(ExperimentManager):
         return [] if self._study is None else self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
 
     def _write_best_trial(self) -> None:
-        if not self._completed_trials() or self._study is None:
+        if not self._completed_trials() or self._study is None or self.algo not in {*PRESETS, *STOCK}:
             return
         best = self._study.best_trial
         path = Path(self.log_folder) / self.algo / f"best_{(self.study_name or self.env_name).replace('/', '-')}.yml"
-        configuration = {**self._configuration, **best.user_attrs.get(ARGUMENTS, {})}
+        drawn = best.user_attrs.get(ARGUMENTS)
+        if drawn is None:  # rl_zoo3's own sampler keeps numbers only
+            drawn = rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER[self.algo](best.params)
+        configuration = {**self._configuration, **drawn}
         origin = (
             f"# Trial {best.number} of the study {self._study.study_name}: mean return {best.value} of its last evaluation\n"
         )

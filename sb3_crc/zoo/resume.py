@@ -51,7 +51,9 @@ def read_plan(flags: Sequence[str]) -> Plan:
         parser.error(
             f"--resume {own.resume}: there are no checkpoints of a run made with --checkpoint-every ({file} is missing)"
         )
-    if (own.resume / CHECKPOINTS / DONE).exists() and not others:
+    # Killed between the last checkpoint and the final model, a run has only that to save
+    saved_model = any(path.name != "best_model.zip" for path in own.resume.glob("*.zip"))
+    if (own.resume / CHECKPOINTS / DONE).exists() and saved_model and not others:
         sys.exit(f"{own.resume} has ended; to prolong it, add -n with a larger number of agent steps")
     saved = json.loads(file.read_text(encoding="utf-8"))
     return Plan([*saved["flags"], *others], own.checkpoint_every or saved["checkpoint_every"], own.resume)

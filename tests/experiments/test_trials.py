@@ -52,6 +52,6 @@ def test_trials_are_read_evaluated_and_replaced(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no run of rl_zoo3"):
+    with pytest.raises(FileNotFoundError, match="no run of train.py"):
         record_trials([tmp_path], tmp_path / "trials.csv")
     assert not (tmp_path / "trials.csv").exists()

@@ -1,0 +1,186 @@
+"""Commands that compare: ``sb3-crc compare | sweep | evaluate | table | curves``."""
+
+import importlib.util
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+app = typer.Typer()
+console = Console()
+errors = Console(stderr=True)
+
+Sources = Annotated[list[Path], typer.Argument(help="folders that contain runs, or CSV files of scores")]
+Mixed = Annotated[bool, typer.Option("--allow-mixed", help="Let scores of different protocols stand in one table.")]
+Jobs = Annotated[int, typer.Option(min=1, help="runs at once; each gets its share of the cores")]
+Every = Annotated[int, typer.Option(min=1, help="agent steps between two checkpoints of a run")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs and what state they are in; start nothing.")]
+
+
+def _in_one_line(command: Callable[..., None]) -> Callable[..., None]:
+    """What the user can mend is said in one line, without a traceback."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except (ValueError, FileNotFoundError) as error:
+            _say(str(error), errors)
+            raise typer.Exit(2) from None
+
+    return guarded
+
+
+@app.command()
+@_in_one_line
+def compare(
+    task: Annotated[list[str], typer.Option(help="domain-task; once for each task")],
+    presets: Annotated[str, typer.Option(help="presets and stock algorithms, separated by commas")] = "crc,rad,sac",
+    seeds: Annotated[int, typer.Option(min=1, help="how many trainings of each")] = 3,
+    first_seed: Annotated[int, typer.Option(min=0, help="of the trainings; the others follow it")] = 0,
+    env_steps: Annotated[int, typer.Option(min=1, help="budget of each run in environment steps")] = 100_000,
+    eval_every: Annotated[int | None, typer.Option(min=1, help="environment steps; else a twentieth of the budget")] = None,
+    eval_episodes: Annotated[int, typer.Option(min=1, help="of each evaluation")] = 10,
+    conf_file: Annotated[Path | None, typer.Option(help="configuration of all; else zoo_configs/<preset>.yml")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder of the runs and of scores.csv")] = Path("comparison"),
+    jobs: Jobs = 1,
+    checkpoint_every: Every = 1_000,
+    dry_run: DryRun = False,
+) -> None:
+    """Train several methods with the same seeds, evaluate them alike, and write scores.csv. The same command goes on."""
+    from sb3_crc.experiments.specs import compared
+
+    specs = compared(
+        [name.strip() for name in presets.split(",") if name.strip()],
+        task,
+        range(first_seed, first_seed + seeds),
+        env_steps=env_steps,
+        eval_every=max(1, env_steps // 20) if eval_every is None else eval_every,
+        eval_episodes=eval_episodes,
+        conf_file=conf_file,
+    )
+    _run(specs, output, jobs, checkpoint_every, dry_run)
+
+
+@app.command()
+@_in_one_line
+def sweep(
+    file: Annotated[Path, typer.Argument(help="YAML file: tasks, seeds, env_steps, variants; see zoo_configs/sweeps")],
+    seeds: Annotated[int | None, typer.Option(min=1, help="instead of the file's")] = None,
+    env_steps: Annotated[int | None, typer.Option(min=1, help="instead of the file's")] = None,
+    conf_file: Annotated[Path | None, typer.Option(help="instead of the file's, for instance zoo_configs/laptop.yml")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder of the runs and of scores.csv")] = Path("sweep"),
+    jobs: Jobs = 1,
+    checkpoint_every: Every = 1_000,
+    dry_run: DryRun = False,
+) -> None:
+    """Train the variants of a sweep file as `compare` does its presets. The same command goes on."""
+    from sb3_crc.experiments.specs import read_sweep
+
+    conf_file = None if conf_file is None else conf_file.absolute()
+    specs = read_sweep(file, seeds=seeds, env_steps=env_steps, conf_file=conf_file)
+    _run(specs, output, jobs, checkpoint_every, dry_run)
+
+
+@app.command()
+@_in_one_line
+def evaluate(
+    runs: Annotated[list[Path], typer.Argument(help="folders of runs of train.py, or that contain some")],
+    episodes: Annotated[int, typer.Option(min=1, help="fresh ones")] = 10,
+    again: Annotated[bool, typer.Option("--again", help="Evaluate also what has been evaluated.")] = False,
+) -> None:
+    """Score final policies: mean action, fresh episodes, seeds that no training and no other evaluation has seen."""
+    from sb3_crc.experiments.final import evaluate_final
+    from sb3_crc.experiments.runs import FINAL, find_runs, read_json
+
+    found = list(find_runs(runs))
+    if not found:
+        raise FileNotFoundError(f"no run of train.py in {', '.join(map(str, runs))}")
+    for run in found:
+        done = (run.folder / FINAL).exists() and not again
+        returns = (read_json(run.folder / FINAL) if done else evaluate_final(run, episodes=episodes))["returns"]
+        episodes_range = f"{min(returns):.1f} to {max(returns):.1f}, {len(returns)} episodes"
+        _say(f"{run.folder}: {sum(returns) / len(returns):.1f} ({episodes_range})")
+
+
+@app.command()
+@_in_one_line
+def table(
+    which: Annotated[str, typer.Argument(help="100k or 500k: environment steps")],
+    sources: Sources,
+    format: Annotated[str, typer.Option(help="text, markdown, latex or csv")] = "text",
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="file to write; else it is printed")] = None,
+    allow_mixed: Mixed = False,
+) -> None:
+    """The paper's table: published scores, ours beside them, and what is missing."""
+    from sb3_crc.experiments.tables import table_text
+
+    text = table_text(which, sources, format, allow_mixed)
+    if output is None:
+        typer.echo(text)
+    else:
+        output.write_text(text + "\n", encoding="utf-8")
+
+
+@app.command()
+@_in_one_line
+def curves(
+    sources: Sources,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder for figures and summaries")] = Path("figures"),
+    baseline: Annotated[str | None, typer.Option(help="the method that others are compared with; the first if absent")] = None,
+    weights: Annotated[Path | None, typer.Option(help="sweep file of convex weights, drawn as a triangle")] = None,
+    allow_mixed: Mixed = False,
+) -> None:
+    """Curves with intervals over environment steps and wall time, profiles, and which differences are resolved."""
+    from sb3_crc.experiments.comparison_figures import draw_comparison, draw_weights
+    from sb3_crc.experiments.scores import read_scores
+    from sb3_crc.experiments.specs import convex_weights
+
+    if importlib.util.find_spec("rliable") is None:
+        raise ValueError("curves needs the extra 'analysis': pip install 'sb3-crc[analysis]'")
+    scores = read_scores(sources)
+    written = draw_comparison(scores, output, baseline=baseline, allow_mixed=allow_mixed)
+    if weights is not None:
+        written += draw_weights(scores, output, convex_weights(weights))
+    for path in written:
+        _say(str(path))
+    for missing in scores.missing:
+        _say(f"missing: {missing}", errors)
+
+
+def _say(line: str, where: Console = console) -> None:
+    where.print(escape(line), soft_wrap=True, highlight=False)  # a path that is to be copied stays on one line
+
+
+def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bool) -> None:
+    from sb3_crc.experiments.pool import Stopped, finished, run_specs
+    from sb3_crc.experiments.scores import read_scores, write_scores
+
+    if dry_run:
+        for spec in specs:
+            state = "finished" if finished(output / spec.name) else "to run"
+            console.print(
+                escape(f"{output / spec.name}: {spec.agent_steps} agent steps, {state}"), soft_wrap=True, highlight=False
+            )
+        return
+
+    def report(spec: Any, event: str, remark: str) -> None:
+        done = sum(finished(output / one.name) for one in specs)
+        _say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
+
+    try:
+        failed = run_specs(specs, output, jobs=jobs, checkpoint_every=checkpoint_every, report=report)
+    except Stopped as stopped:
+        errors.print("Stopped; the same command goes on.")
+        raise typer.Exit(128 + stopped.signum) from None
+    scores = read_scores([output])
+    write_scores(scores, output / "scores.csv")
+    _say(f"{output / 'scores.csv'}: {scores.final['run'].nunique()} runs")
+    for missing in scores.missing:
+        _say(f"missing: {missing}", errors)
+    if failed:
+        raise typer.Exit(1)

@@ -1,0 +1,94 @@
+"""The score of a run: its final policy, after exactly its budget, on fresh episodes."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_crc.atomic import atomic_write
+from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.experiments.provenance import provenance
+from sb3_crc.experiments.runs import FINAL, Run, write_json
+from sb3_crc.presets import PRESETS
+
+#: Seed of the final evaluation of every run: no training has it, and no evaluation during training (sb3_crc.evaluation)
+FIRST_SEED = 10_000
+EPISODES = 10
+
+
+def load_final(run: Run) -> SAC:
+    """
+    :param run: one that has ended
+    :return: its final policy, on the CPU
+    :raises FileNotFoundError: if training has not ended
+    """
+    if not run.model.exists():
+        raise FileNotFoundError(f"{run.folder} has no final policy: its training has not ended ({run.model.name} is missing)")
+    algorithm = CRCSAC if run.preset in PRESETS else SAC
+    return algorithm.load(run.model, device="cpu")
+
+
+def final_returns(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED) -> list[float]:
+    """
+    Evaluate the final policy by its mean action, in the environment that it was trained in.
+
+    :param run: one that has ended
+    :param episodes: how many
+    :param seed: of the environment, from which all its episodes follow
+    :return: their undiscounted returns
+    """
+    return _returns(load_final(run), run, episodes, seed)
+
+
+def evaluate_final(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED) -> dict[str, Any]:
+    """
+    Write ``final.json`` into the run's folder: what the policy after exactly the budget is worth. Never the best checkpoint.
+
+    :param run: one that has ended
+    :param episodes: how many
+    :param seed: of the environment, from which all its episodes follow
+    :return: what was written: ``returns``, and when, on what and how they were measured
+    :raises FileNotFoundError: if training has not ended
+    :raises ValueError: if the policy has seen more or less than the budget
+    """
+    model = load_final(run)
+    steps = model.num_timesteps * run.action_repeat
+    if steps != run.budget:
+        raise ValueError(
+            f"{run.folder}: its policy has seen {steps} environment steps, its budget is {run.budget}; "
+            "only a policy after exactly the budget is scored"
+        )
+    final = {
+        "policy": "final",
+        "environment_steps": steps,
+        "agent_steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "seconds": _training_seconds(run.folder / "evaluations.npz"),
+        "first_seed": seed,
+        "returns": _returns(model, run, episodes, seed),
+        "evaluated": provenance(),
+    }
+    with atomic_write(run.folder / FINAL) as unfinished:
+        write_json(final, unfinished)
+    return final
+
+
+def _returns(model: SAC, run: Run, episodes: int, seed: int) -> list[float]:
+    env = Monitor(gym.make(run.arguments["env"], **{**run.env_kwargs, "seed": seed}))
+    try:
+        returns, _ = evaluate_policy(model, env, n_eval_episodes=episodes, return_episode_rewards=True)
+    finally:
+        env.close()
+    assert isinstance(returns, list)
+    return [float(value) for value in returns]
+
+
+def _training_seconds(evaluations: Path) -> float | None:
+    if not evaluations.exists():
+        return None
+    with np.load(evaluations) as file:
+        return float(file["training_seconds"]) if "training_seconds" in file else None

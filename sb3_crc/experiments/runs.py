@@ -1,0 +1,184 @@
+"""Folders of runs, as ``train.py`` leaves them, and what they say about themselves.
+
+::
+
+    <anything>/<preset>/<env>_1/      a run: evaluations.npz, progress.csv, 0.monitor.csv, checkpoints/, ...
+        <env>/args.yml, config.yml    flags and settings
+        <env>.zip                     the final policy, once training has ended
+        provenance.json               machine, versions, revision of its training
+        final.json                    what the final policy was worth: see final.py
+    <anything>/spec.json              of runs that a comparison made: see specs.py
+    <anything>/failure.json           why the last attempt at it ended early
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_crc.envs.tasks import NAMESPACE, default_action_repeat, task_of
+
+FINAL, PROVENANCE, SPEC, FAILURE = "final.json", "provenance.json", "spec.json", "failure.json"
+
+
+class _ZooLoader(yaml.SafeLoader):
+    """rl_zoo3 writes OrderedDicts; anything else that is no plain data is refused."""
+
+
+def _ordered_dict(loader: yaml.SafeLoader, node: yaml.Node) -> dict[str, Any]:
+    assert isinstance(node, yaml.SequenceNode)
+    (pairs,) = loader.construct_sequence(node, deep=True)
+    return {str(key): value for key, value in pairs}
+
+
+def _list(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
+    assert isinstance(node, yaml.SequenceNode)
+    return list(loader.construct_sequence(node, deep=True))
+
+
+_ZooLoader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered_dict)
+_ZooLoader.add_constructor("tag:yaml.org,2002:python/tuple", _list)
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A folder in which ``train.py`` has begun a training.
+
+    :param folder: ``<anything>/<preset>/<env>_<number>``
+    :raises FileNotFoundError: if it is no such folder
+    :raises ValueError: from properties, if what is in it cannot be read
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        if self._described is None:
+            raise FileNotFoundError(f"{self.folder} is no run of train.py: there is no */args.yml in it")
+
+    @property
+    def preset(self) -> str:
+        """``--algo``: a preset, or a stock algorithm."""
+        return str(self.arguments["algo"])
+
+    @property
+    def method(self) -> str:
+        """What it is called in tables: the preset, if the comparison that it belongs to says nothing else."""
+        return str(self.spec.get("method", self.preset))
+
+    @property
+    def task(self) -> str:
+        """domain-task, or the id of an environment that is none of the suite."""
+        return task_of(self.arguments["env"])
+
+    @property
+    def seed(self) -> int:
+        """Of the training."""
+        return int(self.arguments["seed"])
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps per agent step."""
+        own = default_action_repeat(self.task) if self.arguments["env"].startswith(f"{NAMESPACE}/") else 1
+        return int(self.env_kwargs.get("action_repeat") or own)
+
+    @property
+    def budget(self) -> int:
+        """Environment steps that it was asked for."""
+        asked = int(self.arguments["n_timesteps"])
+        return (asked if asked > 0 else int(self.settings["n_timesteps"])) * self.action_repeat
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Of make_dmc."""
+        return {**(self.arguments.get("env_kwargs") or {}), **self.settings.get("env_kwargs", {})}
+
+    @property
+    def model(self) -> Path:
+        """The final policy; missing until training has ended."""
+        assert self._described is not None
+        return self.folder / f"{self._described.name}.zip"
+
+    @property
+    def status(self) -> str:
+        """finished, unevaluated (``sb3-crc evaluate`` was not run), failed, or unfinished: killed, stopped or running."""
+        if (self.folder / FINAL).exists():
+            return "finished"
+        if self.spec_folder is not None and (self.spec_folder / FAILURE).exists():
+            return "failed"
+        ended = self.model.exists() and (
+            not (self.folder / "checkpoints").is_dir() or (self.folder / "checkpoints" / "DONE").exists()
+        )
+        return "unevaluated" if ended else "unfinished"
+
+    @cached_property
+    def arguments(self) -> dict[str, Any]:
+        """Flags of train.py."""
+        return self._read("args.yml")
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Hyper-parameters, with env_kwargs and n_timesteps."""
+        return self._read("config.yml")
+
+    @property
+    def spec_folder(self) -> Path | None:
+        """The folder that a comparison made for it; None if it was trained by hand."""
+        folder = self.folder.parent.parent
+        return folder if (folder / SPEC).exists() else None
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """What the comparison asked for; empty if it was trained by hand."""
+        return {} if self.spec_folder is None else read_json(self.spec_folder / SPEC)
+
+    @property
+    def _described(self) -> Path | None:
+        return next((path.parent for path in sorted(self.folder.glob("*/args.yml"))), None)
+
+    def _read(self, name: str) -> dict[str, Any]:
+        assert self._described is not None
+        path = self._described / name
+        try:
+            return dict(yaml.load(path.read_text(encoding="utf-8"), _ZooLoader))  # a SafeLoader
+        except (OSError, yaml.YAMLError, ValueError, TypeError) as error:
+            raise ValueError(f"{path} cannot be read: {error}") from error
+
+
+def find_runs(folders: Iterable[Path]) -> Iterator[Run]:
+    """
+    :param folders: of runs, or of anything that contains runs
+    :return: every run in them, in the order of their paths
+    :raises FileNotFoundError: if one does not exist
+    """
+    seen = set()
+    for folder in folders:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder} is no folder")
+        for described in sorted(folder.rglob("args.yml")):
+            run = described.parent.parent
+            if run not in seen:
+                seen.add(run)
+                yield Run(run)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """
+    :raises ValueError: if it is no JSON mapping, naming the file
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is no JSON mapping")
+    return content
+
+
+def write_json(content: dict[str, Any], path: Path) -> None:
+    """:param content: plain data; :param path: file to write"""
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

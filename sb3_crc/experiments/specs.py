@@ -1,0 +1,201 @@
+"""What a comparison consists of: runs, each described completely before it begins and named by its content.
+
+A sweep file names variants, and what each changes in the configuration of its preset::
+
+    env_steps: 100_000
+    eval_every: 5_000            # environment steps between two evaluations
+    tasks: [cartpole-swingup]
+    seeds: 3                     # 0, 1, 2; or a list
+    variants:
+      C+R+C: {preset: crc}
+      C+R: {preset: crc, objectives.consistency: null}      # a dotted key reaches into a mapping, null removes
+"""
+
+import hashlib
+import inspect
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3 import SAC
+
+from sb3_crc.configurations import configuration_file, read_settings, with_overrides
+from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.envs.tasks import default_action_repeat, environment_id
+from sb3_crc.objectives import objective_weights
+from sb3_crc.presets import PRESETS
+from sb3_crc.settings import check_name
+from sb3_crc.stock import STOCK
+
+#: Settings of a configuration that are rl_zoo3's, not the algorithm's
+ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs"}
+SWEEP_KEYS = {"tasks", "seeds", "env_steps", "eval_every", "eval_episodes", "variants", "conf_file"}
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """
+    One training, and how it is evaluated.
+
+    :param method: what it is called in tables
+    :param preset: ``--algo`` of train.py
+    :param task: domain-task
+    :param seed: of the training
+    :param env_steps: the budget in environment steps, random ones and repeats included
+    :param eval_every: environment steps between two evaluations of the current policy
+    :param eval_episodes: of each of them, and of the final policy
+    :param settings: of rl_zoo3 for this environment, complete
+    :raises ValueError: if steps are no multiple of the action repeat, or a setting does not exist or cannot work
+    """
+
+    method: str
+    preset: str
+    task: str
+    seed: int
+    env_steps: int
+    eval_every: int
+    eval_episodes: int
+    settings: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        repeat = self.action_repeat
+        for name in ("env_steps", "eval_every"):
+            value = getattr(self, name)
+            if value < 1 or value % repeat != 0:
+                raise ValueError(
+                    f"{self.method} on {self.task}: {name}={value} must be a positive multiple of the action repeat, {repeat}"
+                )
+        if self.eval_episodes < 1:
+            raise ValueError(f"{self.method} on {self.task}: eval_episodes={self.eval_episodes} must be at least 1")
+        learning_starts = self.settings.get("learning_starts", 0)
+        if self.agent_steps <= learning_starts:
+            raise ValueError(
+                f"{self.method} on {self.task}: {self.env_steps} environment steps are {self.agent_steps} agent steps; with "
+                f"learning_starts={learning_starts} nothing would be learned"
+            )
+        algorithm = CRCSAC if self.preset in PRESETS else SAC
+        known = {*inspect.signature(SAC.__init__).parameters, *inspect.signature(algorithm.__init__).parameters}
+        for name in self.settings:
+            check_name(f"{self.method}: setting", name, sorted((known | ZOO_SETTINGS) - {"self", "env", "kwargs"}))
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps per agent step."""
+        own = (self.settings.get("env_kwargs") or {}).get("action_repeat")
+        return int(own or default_action_repeat(self.task))
+
+    @property
+    def agent_steps(self) -> int:
+        """The budget in decisions."""
+        return self.env_steps // self.action_repeat
+
+    @property
+    def name(self) -> str:
+        """Relative path of its folder; it ends with a digest of everything that decides what the run will be."""
+        content = {name: value for name, value in asdict(self).items() if name != "method"}
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
+        return f"{self.task}/{self.method}/seed_{self.seed}-{digest}"
+
+
+def compared(
+    presets: Sequence[str],
+    tasks: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    env_steps: int,
+    eval_every: int,
+    eval_episodes: int = 10,
+    conf_file: Path | None = None,
+) -> list[RunSpec]:
+    """
+    :param presets: presets or stock algorithms; each is its own method
+    :param tasks: domain-task
+    :param seeds: of the trainings; the same for all methods
+    :param env_steps: see :class:`RunSpec`, like what follows
+    :param conf_file: configuration of all of them; None: each preset's own file
+    :return: a run for each of task, seed and preset, in this order, so that what is compared comes together
+    :raises ValueError: for unknown names or values that cannot work, before anything runs
+    """
+    variants = {preset: {"preset": preset} for preset in presets}
+    protocol = {"env_steps": env_steps, "eval_every": eval_every, "eval_episodes": eval_episodes}
+    return _grid(variants, tasks, seeds, conf_file=conf_file, **protocol)
+
+
+def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
+    """
+    :param file: as described at the top of this module; ``conf_file`` in it is relative to it
+    :param overrides: keys of it that count instead; None: the file's
+    :return: a run for each of task, seed and variant
+    :raises FileNotFoundError: if it is missing
+    :raises ValueError: naming file and key, for what is no sweep
+    """
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} is no sweep: it must be a mapping with {', '.join(sorted(SWEEP_KEYS))}")
+    content |= {name: value for name, value in overrides.items() if value is not None}
+    for key in content:
+        check_name(f"{file}: key", key, sorted(SWEEP_KEYS))
+    if lacking := sorted({"tasks", "seeds", "env_steps", "variants"} - content.keys()):
+        raise ValueError(f"{file} is no sweep: it has no {', '.join(lacking)}")
+    seeds = content["seeds"]
+    conf_file = content.get("conf_file")
+    return _grid(
+        content["variants"],
+        content["tasks"],
+        range(seeds) if isinstance(seeds, int) else seeds,
+        env_steps=content["env_steps"],
+        eval_every=content.get("eval_every", max(1, content["env_steps"] // 20)),
+        eval_episodes=content.get("eval_episodes", 10),
+        conf_file=None if conf_file is None else file.parent / conf_file,
+    )
+
+
+def convex_weights(file: Path) -> dict[str, tuple[float, float, float]]:
+    """
+    :param file: a sweep
+    :return: variant -> weights of contrastive, reconstruction and consistency, in shares of 1; none for a variant without them
+    """
+    found = {}
+    for spec in read_sweep(file):
+        weights = objective_weights(spec.settings.get("objectives", {}))
+        own = [weights.get(name, 0.0) for name in ("contrastive", "reconstruction", "consistency")]
+        if sum(own) > 0:
+            found[spec.method] = own[0] / sum(own), own[1] / sum(own), own[2] / sum(own)
+    return found
+
+
+def _grid(
+    variants: Mapping[str, Mapping[str, Any]],
+    tasks: Iterable[str],
+    seeds: Iterable[int],
+    *,
+    conf_file: Path | None,
+    **protocol: Any,
+) -> list[RunSpec]:
+    tasks, seeds = list(tasks), list(seeds)
+    for name, values in (("tasks", tasks), ("seeds", seeds), ("variants", variants)):
+        if not values:
+            raise ValueError(f"{name} is empty: there is nothing to run")
+    resolved = {}
+    for method, changes in variants.items():
+        overrides = dict(changes)
+        preset = overrides.pop("preset", method)
+        check_name(f"preset of {method!r}", preset, [*PRESETS, *STOCK])
+        file = configuration_file(preset) if conf_file is None else conf_file
+        for task in tasks:
+            settings = read_settings(file, preset, environment_id(task))
+            if preset in PRESETS:  # written out, so that overrides find what they change and later defaults change nothing
+                settings = {**PRESETS[preset], **settings}
+            settings = with_overrides(settings, overrides)
+            settings.pop("n_timesteps", None)  # the budget decides
+            resolved[method, task] = preset, settings
+    return [
+        RunSpec(method=method, preset=preset, task=task, seed=seed, settings=settings, **protocol)
+        for task in tasks
+        for seed in seeds
+        for method in variants
+        for preset, settings in [resolved[method, task]]
+    ]

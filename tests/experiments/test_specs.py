@@ -1,0 +1,130 @@
+"""What a comparison consists of."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_crc import PRESETS
+from sb3_crc.configurations import CONFIGS
+from sb3_crc.experiments.specs import compared, convex_weights, read_sweep
+
+LAPTOP = CONFIGS / "laptop.yml"
+SWEEP = """
+env_steps: 16000
+eval_every: 8000
+tasks: [cartpole-swingup]
+seeds: [3, 5]
+conf_file: own.yml
+variants:
+  rad: {}
+  half: {preset: crc, objectives.contrastive.weight: 0.5, env_kwargs.render_quality: fast}
+"""
+OWN = """
+default:
+  policy: CnnPolicy
+  env_kwargs: {image_size: 36}
+  presets:
+    crc: {objectives: {contrastive: 0.7, reconstruction: {weight: 0.3, bits: 5}}}
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    (tmp_path / "own.yml").write_text(OWN)
+    (tmp_path / "sweep.yml").write_text(SWEEP)
+    return tmp_path / "sweep.yml"
+
+
+def test_the_same_seeds_and_steps_for_all_and_what_is_compared_comes_together() -> None:
+    methods, tasks = ["crc", "rad", "sac"], ["cartpole-swingup", "walker-walk"]
+    specs = compared(methods, tasks, [4, 7], env_steps=8_000, eval_every=1_600, conf_file=LAPTOP)
+    assert [(spec.task, spec.seed, spec.method) for spec in specs] == [
+        (task, seed, method) for task in tasks for seed in (4, 7) for method in methods
+    ]
+    assert {spec.agent_steps for spec in specs if spec.task == "cartpole-swingup"} == {1_000}
+    assert {spec.agent_steps for spec in specs if spec.task == "walker-walk"} == {4_000}
+    assert len({spec.name for spec in specs}) == 12
+
+
+def test_a_preset_brings_what_the_file_leaves_open() -> None:
+    curl, sac = compared(["curl", "sac"], ["cartpole-swingup"], [0], env_steps=8_000, eval_every=800, conf_file=LAPTOP)
+    assert curl.settings["objectives"] == PRESETS["curl"]["objectives"]
+    assert curl.settings["augmentation"] == "random_shift"
+    assert "objectives" not in sac.settings and sac.settings["env_kwargs"] == curl.settings["env_kwargs"]
+
+
+def test_a_name_says_everything_that_decides_what_comes_out() -> None:
+    common = {"env_steps": 16_000, "eval_every": 800, "conf_file": LAPTOP}
+    (spec,) = compared(["rad"], ["cartpole-swingup"], [0], **common)
+    assert spec.name == compared(["rad"], ["cartpole-swingup"], [0], **common)[0].name
+    others = [
+        compared(["rad"], ["cartpole-swingup"], [1], **common),
+        compared(["rad"], ["cartpole-swingup"], [0], **{**common, "env_steps": 24_000}),
+        compared(["rad"], ["cartpole-swingup"], [0], **{**common, "eval_every": 1_600}),
+        compared(["rad"], ["cartpole-swingup"], [0], **common, eval_episodes=3),
+        compared(["rad"], ["cartpole-swingup"], [0], **{**common, "conf_file": None}),
+    ]
+    assert spec.name not in {other.name for (other,) in others}
+
+
+def test_a_sweep_reaches_into_settings(file: Path) -> None:
+    specs = read_sweep(file)
+    assert [(spec.method, spec.seed) for spec in specs] == [("rad", 3), ("half", 3), ("rad", 5), ("half", 5)]
+    half = specs[1].settings
+    assert half["objectives"] == {"contrastive": {"weight": 0.5}, "reconstruction": {"weight": 0.3, "bits": 5}}
+    assert half["env_kwargs"] == {"image_size": 36, "render_quality": "fast"}
+    assert specs[0].settings["env_kwargs"] == {"image_size": 36}, "variants must not share what they change"
+    assert [spec.seed for spec in read_sweep(file, seeds=1)] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("rad: {}", "red: {}", "preset of 'red'"),
+        ("rad: {}", "rad: {learning_rat: 1}", "learning_rat"),
+        ("env_steps: 16000", "env_steps: 16001", "env_steps=16001 must be a positive multiple of the action repeat, 8"),
+        ("eval_every: 8000", "eval_every: 4", "eval_every=4 must be"),
+        ("tasks: [cartpole-swingup]", "tasks: []", "tasks is empty"),
+        ("tasks: [cartpole-swingup]", "task: cartpole-swingup", "key"),
+        ("seeds: [3, 5]", "", "has no seeds"),
+        ("env_kwargs.render_quality: fast", "learning_starts: 2000", "nothing would be learned"),
+    ],
+)
+def test_mistakes_are_named_before_anything_runs(file: Path, old: str, new: str, message: str) -> None:
+    assert old in SWEEP
+    file.write_text(SWEEP.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        read_sweep(file)
+
+
+def test_the_ablations_of_the_paper() -> None:
+    for configuration in (None, LAPTOP):
+        first = read_sweep(CONFIGS / "sweeps" / "ablation_1.yml", conf_file=configuration)
+        losses = {spec.method: "".join(sorted(name[2] for name in spec.settings["objectives"])) for spec in first}
+        # n: contrastive and consistency, c: reconstruction
+        assert losses == {
+            "none": "",
+            "contrastive": "n",
+            "contrastive+reconstruction": "cn",
+            "all-three": "cnn",
+            "all-but-contrastive": "cn",
+            "all-but-reconstruction": "nn",
+        }
+        assert len({spec.name for spec in first}) == 18
+        (everything,) = (spec for spec in first if spec.method == "all-three" and spec.seed == 0)
+        (crc,) = compared(["crc"], ["cartpole-swingup"], [0], env_steps=100_000, eval_every=5_000, conf_file=configuration)
+        assert everything.settings == crc.settings
+
+
+def test_the_convex_weights_of_the_second_ablation() -> None:
+    weights = convex_weights(CONFIGS / "sweeps" / "ablation_2.yml")
+    assert len(weights) == 10
+    for name, shares in weights.items():
+        assert sum(shares) == pytest.approx(1)
+        assert [round(100 * share) for share in shares] == pytest.approx([int(part) for part in name.split("-")], abs=1)
+
+
+def test_sweep_files_are_plain_yaml() -> None:
+    for path in (CONFIGS / "sweeps").glob("*.yml"):
+        assert isinstance(yaml.safe_load(path.read_text()), dict)
