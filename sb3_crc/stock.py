@@ -46,9 +46,6 @@ class StockSAC(SAC):
             self.replay_buffer_kwargs = {"frame_channels": channels, **self.replay_buffer_kwargs}
         super()._setup_model()
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "between_updates"]  # a TrainingCheckpoint's, while it trains
-
 
 class MatchedSAC(StockSAC):
     """A :class:`StockSAC` whose actor and critic each see through a :class:`~sb3_crc.PixelEncoder` of their own by default."""

@@ -86,7 +86,8 @@ class TrainingCheckpoint(BaseCallback):
         self._writer = ThreadPoolExecutor(1, "checkpoint")
         self._request = StopRequest()
         self._request.listen()
-        self.model.between_updates = self._stop_if_overdue  # type: ignore[attr-defined]
+        if hasattr(self.model, "between_updates"):  # an attribute that a stock algorithm does not know would be saved with it
+            self.model.between_updates = self._stop_if_overdue
         checkpoint = self.store.newest()
         if checkpoint is None:
             self._saved_at = self.model.num_timesteps

@@ -167,8 +167,10 @@ def final_means(table: "pd.DataFrame") -> "pd.DataFrame":
     """
     :param table: rows of final policies
     :return: columns method, task, seed, return: the mean over the episodes of each run's final evaluation
-    :raises ValueError: if a seed of a method was run twice, naming the runs
+    :raises ValueError: if a return is no number, or a seed of a method was run twice, naming the runs
     """
+    if (broken := table[table["return"].isna()]).size:
+        raise ValueError(f"a final return is no number in {', '.join(sorted(set(broken['run'])))}")
     runs = table.groupby(["method", "task", "seed"], sort=False)["run"].unique()
     for (method, task, seed), folders in runs.items():
         if len(folders) > 1:

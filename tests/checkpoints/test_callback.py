@@ -133,6 +133,21 @@ def test_a_signal_need_not_wait_for_long_updates(tmp_path: Path, monkeypatch: py
     TrainingCheckpoint(tmp_path)._take_lock()
 
 
+def test_a_stock_algorithm_is_saved_while_checkpoints_are_made(tmp_path: Path) -> None:
+    model = SAC(
+        "CnnPolicy",
+        NoiseEnv(channels=3),
+        learning_starts=100,
+        replay_buffer_class=FrameReplayBuffer,
+        replay_buffer_kwargs={"frame_channels": 3},
+        buffer_size=100,
+        policy_kwargs={"features_extractor_class": PixelEncoder, "net_arch": [8]},
+    )
+    best = EvalCallback(NoiseEnv(channels=3), eval_freq=10, best_model_save_path=str(tmp_path), verbose=0, warn=False)
+    model.learn(15, callback=[best, TrainingCheckpoint(tmp_path / "checkpoints", every=5)])
+    assert SAC.load(tmp_path / "best_model").num_timesteps == 10
+
+
 def test_it_costs_nothing_to_the_run(whole: CRCSAC, tmp_path: Path) -> None:
     """A run without checkpoints draws the same random numbers."""
     model = CRCSAC("CnnPolicy", cartpole(0), seed=0, **SETTINGS)
