@@ -59,8 +59,8 @@ def plan(specs: Sequence[RunSpec], root: Path) -> list[RunSpec]:
         folder = root / spec.name
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / SPEC).exists():
-            settings = yaml.safe_dump({environment_id(spec.task): dict(spec.settings)}, sort_keys=False)
-            (folder / SETTINGS).write_text(settings, encoding="utf-8")
+            settings = {environment_id(spec.task): {"n_timesteps": spec.agent_steps, **spec.settings}}
+            (folder / SETTINGS).write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
             write_json(asdict(spec), folder / SPEC)
     return [spec for spec in specs if not finished(root / spec.name)]
 
