@@ -91,26 +91,26 @@ def test_the_bilinear_matrix_starts_positive_and_stays_symmetric() -> None:
 
 
 def test_reconstruction_adds_the_papers_penalties() -> None:
-    class Anchor:
+    class Query:
         latent = th.randn(4, 16)
         images = th.randint(0, 256, (4, *SHAPE), dtype=th.uint8)
         pixels = images / 255
 
     class Batch:
-        anchor = Anchor
+        query = Query
 
     objective = Reconstruction(16, SHAPE, 2, channels=(8,), strides=(2,), latent_penalty=0.3, decoder_penalty=0.01)
-    squared_error = ((objective.decoder(Anchor.latent) - Anchor.pixels) ** 2).mean()
-    latent = 0.3 * (Anchor.latent**2).sum() / 4 / 2
+    squared_error = ((objective.decoder(Query.latent) - Query.pixels) ** 2).mean()
+    latent = 0.3 * (Query.latent**2).sum() / 4 / 2
     weights = 0.01 * sum((parameter**2).sum() for parameter in objective.decoder.parameters()) / 2
     assert objective(Batch).item() == pytest.approx((squared_error + latent + weights).item(), rel=1e-5)
 
 
 @pytest.mark.parametrize("key", ["positive", "next", "bootstrap"])
 def test_the_key_is_the_latent_of_the_view_that_is_named(key: str) -> None:
-    latents = {name: SimpleNamespace(latent=th.randn(6, 16), key_latent=th.randn(6, 16)) for name in ("anchor", key)}
+    latents = {name: SimpleNamespace(latent=th.randn(6, 16), key_latent=th.randn(6, 16)) for name in ("query", key)}
     objective = Contrastive(16, SHAPE, 2, key=key)
-    expected = info_nce(latents["anchor"].latent, latents[key].key_latent, objective.bilinear)
+    expected = info_nce(latents["query"].latent, latents[key].key_latent, objective.bilinear)
     assert th.equal(objective(SimpleNamespace(**latents)), expected)  # no other view is there to be read
     assert objective.reads_next == (key == "next")
 
@@ -121,8 +121,8 @@ def test_a_key_that_is_no_view_is_refused() -> None:
 
 
 def reconstruction_views(images: th.Tensor, latents: th.Tensor) -> SimpleNamespace:
-    """Views whose anchor is painted wrongly on purpose where only the clean view may be read."""
-    return SimpleNamespace(anchor=SimpleNamespace(latent=latents), clean=SimpleNamespace(images=images, pixels=images / 255))
+    """Views whose query has a latent and no images, where only the clean view's may be read."""
+    return SimpleNamespace(query=SimpleNamespace(latent=latents), clean=SimpleNamespace(images=images, pixels=images / 255))
 
 
 def test_a_half_size_standardised_reconstruction_of_the_clean_view_equals_numpy() -> None:
