@@ -41,6 +41,7 @@ COLUMNS: dict[str, str] = {
 }
 #: What must be equal for the final policies of two runs of one task to stand in one table
 PROTOCOL = ("budget", "episodes", "first_seed", "action_repeat", "render_quality")
+_WHOLE = {"first_seed": "Int64", "updates": "Int64"}  # pandas' integers that may be missing
 
 
 class MixedProtocols(ValueError):
@@ -128,7 +129,7 @@ def run_scores(run: Run) -> "pd.DataFrame":
         "run": str(run.folder),
     }
     rows = [common | row for row in (*_current(run), *_final(run))]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype(_WHOLE)
 
 
 def write_scores(scores: Scores, path: Path) -> None:
@@ -239,7 +240,8 @@ def _read_csv(path: Path) -> "pd.DataFrame":
     import pandas as pd
 
     try:
-        table = pd.read_csv(path, keep_default_na=False, na_values=[""], dtype={"git_revision": str, "render_quality": str})
+        types = {"git_revision": "str", "render_quality": "str", **_WHOLE}
+        table = pd.read_csv(path, keep_default_na=False, na_values=[""], dtype=types)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     if lacking := [column for column in COLUMNS if column not in table]:
