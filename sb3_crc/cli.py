@@ -1,4 +1,4 @@
-"""The command line, ``sb3-crc`` or ``python -m sb3_crc``: what works here, measurements, comparisons.
+"""The command line, ``sb3-crc`` or ``python -m sb3_crc``: what works here, measurements, comparisons, analyses.
 
 Training is ``train.py``.
 """
@@ -14,10 +14,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sb3_crc.analysis.commands import app as analysis
 from sb3_crc.experiments.commands import app as experiments
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="CRC-RL for Stable-Baselines3.")
 app.add_typer(experiments)
+app.add_typer(analysis)
 console = Console()
 errors = Console(stderr=True)
 
