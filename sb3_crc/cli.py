@@ -10,18 +10,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sb3_crc.analysis.commands import app as analysis
+from sb3_crc.console import console, errors, say
 from sb3_crc.experiments.commands import app as experiments
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="CRC-RL for Stable-Baselines3.")
 app.add_typer(experiments)
 app.add_typer(analysis)
-console = Console()
-errors = Console(stderr=True)
 
 MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "broken": "[red]broken[/]"}
 
@@ -46,7 +44,7 @@ def doctor() -> None:
     console.print(table)
     broken = [finding for finding in findings if finding.verdict == "broken"]
     for finding in broken:  # once more outside the table, where a command that is to be copied stays on one line
-        errors.print(escape(f"{finding.name}: {finding.value}"), soft_wrap=True, highlight=False)
+        say(f"{finding.name}: {finding.value}", errors)
     if broken:
         raise typer.Exit(1)
 
@@ -70,11 +68,9 @@ def rendering(
             install_system_library()
             outcome = prove_backend()
     except RenderingUnavailable as error:
-        # soft_wrap: a command that is to be copied must stay on one line
-        errors.print(escape(str(error)), soft_wrap=True, highlight=False)
+        say(str(error), errors)
         raise typer.Exit(2) from None
-    line = f"pictures are drawn by {outcome.backend}: {outcome.renderer}"
-    console.print(escape(line), soft_wrap=True, highlight=False)
+    say(f"pictures are drawn by {outcome.backend}: {outcome.renderer}")
 
 
 @app.command()
@@ -149,7 +145,7 @@ def trials(
     from sb3_crc.experiments.trials import record_trials
 
     for row in record_trials(runs, output, episodes=episodes, note=note):
-        console.print(f"{row['trial']}: {row.get('final_mean', 'not finished')}", soft_wrap=True, highlight=False)
+        say(f"{row['trial']}: {row.get('final_mean', 'not finished')}")
 
 
 @app.command()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Space
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_crc.envs.distractions import DISTRACTIONS, MASKS, DistractionWrapper, make_distraction
 from sb3_crc.envs.simulator import LARGE_PICTURE, Action, Observation, SimulatorStep, StepResult, load_simulator
 from sb3_crc.envs.state import State, check_state
 from sb3_crc.envs.tasks import default_action_repeat, default_camera, split_task
@@ -38,6 +40,9 @@ def make_dmc(
     render_quality: str = "benchmark",
     observation: str = "pixels",
     render_mode: str | None = "rgb_array",
+    distraction: str | None = None,
+    distraction_data: str | Path | None = None,
+    distraction_mask: str = "chroma",
 ) -> DecisionEnv:
     """Make a task of the dm_control suite as a Gymnasium environment whose step is one decision of the agent.
 
@@ -62,9 +67,19 @@ def make_dmc(
         after a reset; "state": float32 (n,), the task's own observations side by side in alphabetical order of their names;
         "dict": the stack under "pixels" and each of the task's own observations under its name, float32 (n,)
     :param render_mode: "rgb_array", or None if ``render()`` is not needed
+    :param distraction: a test environment: "color_easy", "color_hard", "video_easy" or "video_hard" of DMControl-GB
+        (arXiv 2011.13389), "dcs_easy", "dcs_medium" or "dcs_hard" of the Distracting Control Suite (arXiv 2101.02722).
+        ``env.get_wrapper_attr("distraction_label")`` says what is shown
+    :param distraction_data: DMControl-GB's table of colours (.npz, .json, or a folder with ``<distraction>.npz``); for the
+        others a folder of clips (.mp4, .npz, .npy), or one that has a folder ``<distraction>``. None: generated colours and
+        clips, which are not the benchmark's
+    :param distraction_mask: of the videos: "chroma" replaces what is green, as in the benchmark, "segmentation" what is
+        background
     :return: the environment; it has the attributes ``action_repeat`` and, with pictures, ``frame_channels``; its whole state
         can be saved, see :meth:`DecisionEnv.get_state`
-    :raises ValueError: for an unknown task or a value that is not allowed, with the nearest one that is
+    :raises ValueError: for an unknown task or a value that is not allowed, with the nearest one that is; for data of a
+        distraction that cannot be used, naming the file
+    :raises FileNotFoundError: if these data are missing
     :raises RenderingUnavailable: if pixels are wanted and no OpenGL back end can draw
     """
     domain, subtask = split_task(task)
@@ -72,6 +87,7 @@ def make_dmc(
     _check_choice("observation", observation, OBSERVATIONS)
     _check_choice("render_quality", render_quality, RENDER_QUALITIES)
     _check_choice("render_mode", render_mode, ("rgb_array", None))
+    _check_distraction(distraction, distraction_data, distraction_mask, observation)
     action_repeat = default_action_repeat(task) if action_repeat is None else action_repeat
     camera_id = default_camera(task) if camera_id is None else camera_id
     for name, value in (("image_size", image_size), ("action_repeat", action_repeat), ("frame_stack", frame_stack)):
@@ -94,11 +110,26 @@ def make_dmc(
     if np.any(env.action_space.low != -1.0) or np.any(env.action_space.high != 1.0):  # type: ignore[attr-defined]
         env = gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
     env = gym.wrappers.RepeatAction(env, action_repeat)
+    distracted: DistractionWrapper | None = None
+    if distraction is not None:
+        differs = make_distraction(
+            distraction,
+            distraction_data,
+            distraction_mask,
+            domain=domain,
+            image_size=image_size,
+            camera_id=camera_id,
+            action_repeat=action_repeat,
+        )
+        env = distracted = DistractionWrapper(env, differs, task)
     settings = {"task": task, "observation": observation, "action_repeat": int(action_repeat)}
     made: DecisionEnv
     if has_pictures:
         pictures = {"image_size": int(image_size), "frame_stack": int(frame_stack), "camera_id": int(camera_id)}
         settings |= {**pictures, "render_quality": render_quality}
+        if distraction is not None:
+            data = None if distraction_data is None else str(distraction_data)
+            settings |= {"distraction": distraction, "distraction_data": data, "distraction_mask": distraction_mask}
         env = gym.wrappers.AddRenderObservation(env, render_only=observation == "pixels", render_key=IMAGE_KEY)
         stack = PixelStack if observation == "pixels" else DictStack
         made = stack(env, action_repeat, frame_stack, render_mode=render_mode, settings=settings)
@@ -109,6 +140,8 @@ def make_dmc(
         env = gym.wrappers.TransformObservation(env, _single_precision, space)
         made = DecisionEnv(env, action_repeat, render_mode=render_mode, settings=settings)
     counter.await_reset(seed)
+    if distracted is not None:
+        distracted.await_reset(seed)
     if seed is not None:
         made.action_space.seed(seed)
     return made
@@ -136,6 +169,7 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.action_repeat = action_repeat
         self._render_mode = render_mode
         self._settings = settings or {}
+        self._is_distracted = self.env.has_wrapper_attr("distraction_label")
         # Shimmy writes a wrong rate into a dict shared by all its environments: the last one made would set everybody's.
         control_timestep = float(self.get_wrapper_attr("control_timestep")())  # seconds
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1.0 / (control_timestep * action_repeat)}
@@ -144,6 +178,11 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def render_mode(self) -> str | None:  # type: ignore[override]  # gymnasium's Env has it as an attribute
         """What ``render()`` returns: "rgb_array", or None for nothing."""
         return self._render_mode
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of :func:`make_dmc` that make another environment like this one, but for ``seed`` and ``render_mode``."""
+        return dict(self._settings)
 
     def render(self) -> Any:
         """The current scene, uint8 (480, 480, 3) or larger, through the same camera and at the same quality.
@@ -155,8 +194,9 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         render_kwargs = dict(self.get_wrapper_attr("render_kwargs"))
         render_kwargs["height"] = max(render_kwargs["height"], LARGE_PICTURE)
         render_kwargs["width"] = max(render_kwargs["width"], LARGE_PICTURE)
+        draw = self.get_wrapper_attr("draw_large") if self._is_distracted else self.get_wrapper_attr("physics").render
         # dm_control returns a view with a negative stride, which torch and video encoders refuse.
-        return np.ascontiguousarray(self.get_wrapper_attr("physics").render(**render_kwargs))
+        return np.ascontiguousarray(draw(**render_kwargs))
 
     def get_state(self) -> State:
         """Everything on which the future of this environment depends, random numbers of later resets and actions included.
@@ -167,11 +207,14 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
         :return: nested dictionaries of NumPy arrays, strings, booleans, numbers and None, for ``np.savez`` and JSON
         """
-        return {
+        state = {
             "settings": dict(self._settings),
             "simulator": self.get_wrapper_attr("get_simulator_state")(),
             "action_space": self.action_space.np_random.bit_generator.state,
         }
+        if self._is_distracted:
+            state["distraction"] = self.get_wrapper_attr("get_distraction_state")()
+        return state
 
     def set_state(self, state: State) -> None:
         """Continue where :meth:`get_state` was called; no reset is needed.
@@ -186,6 +229,8 @@ class DecisionEnv(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _set_checked_state(self, state: State) -> None:
         self.get_wrapper_attr("set_simulator_state")(state["simulator"])
+        if self._is_distracted:
+            self.get_wrapper_attr("set_distraction_state")(state["distraction"])
         self.action_space.np_random.bit_generator.state = state["action_space"]
 
 
@@ -300,6 +345,15 @@ def _check_choice(name: str, value: object, allowed: tuple[object, ...]) -> None
         nearest = difflib.get_close_matches(value, [known for known in allowed if isinstance(known, str)], n=1, cutoff=0.0)
         message += f" Did you mean {nearest[0]!r}?"
     raise ValueError(message)
+
+
+def _check_distraction(distraction: str | None, data: str | Path | None, mask: str, observation: str) -> None:
+    _check_choice("distraction", distraction, (None, *DISTRACTIONS))
+    _check_choice("distraction_mask", mask, MASKS)
+    if distraction is not None and observation == "state":
+        raise ValueError(f"distraction={distraction!r} changes pictures, but observation='state' has none.")
+    if distraction is None and data is not None:
+        raise ValueError(f"distraction_data={str(data)!r} is for a distraction, but none is given.")
 
 
 def _check_integer(name: str, value: object, *, lowest: int, highest: int | None = None, what: str = "") -> None:

@@ -128,12 +128,21 @@ class SimulatorStep(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
         ``Physics.render`` draws the same, but builds and frees a scene each time, which takes longer than drawing a fast one.
         """
+        return self.take_picture()
+
+    def take_picture(self, *, segmentation: bool = False) -> Any:
+        """
+        :param segmentation: not the picture but what is seen in it
+        :return: as :meth:`render`; or int32 (S, S, 2), upside down in memory: id and type of the object, -1 for none
+        """
         size_and_camera = dict(self.get_wrapper_attr("render_kwargs"))
         flags = size_and_camera.pop("render_flag_overrides", None)
         if self._camera is None:
             from dm_control.mujoco.engine import Camera
 
             self._camera = Camera(self.get_wrapper_attr("physics"), **size_and_camera)
+        if segmentation:
+            return self._camera.render(segmentation=True)
         return self._camera.render(render_flag_overrides=flags)
 
     def close(self) -> None:

@@ -1,18 +1,14 @@
 """Commands that compare: ``sb3-crc compare | sweep | evaluate | table | curves``."""
 
 import importlib.util
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
+
+from sb3_crc.console import errors, in_one_line, say
 
 app = typer.Typer()
-console = Console()
-errors = Console(stderr=True)
 
 Sources = Annotated[list[Path], typer.Argument(help="folders that contain runs, or CSV files of scores")]
 Mixed = Annotated[bool, typer.Option("--allow-mixed", help="Let scores of different protocols stand in one table.")]
@@ -21,22 +17,8 @@ Every = Annotated[int, typer.Option(min=1, help="agent steps between two checkpo
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs and what state they are in; start nothing.")]
 
 
-def _in_one_line(command: Callable[..., None]) -> Callable[..., None]:
-    """What the user can mend is said in one line, without a traceback."""
-
-    @wraps(command)
-    def guarded(*args: Any, **kwargs: Any) -> None:
-        try:
-            command(*args, **kwargs)
-        except (ValueError, FileNotFoundError) as error:
-            _say(str(error), errors)
-            raise typer.Exit(2) from None
-
-    return guarded
-
-
 @app.command()
-@_in_one_line
+@in_one_line
 def compare(
     task: Annotated[list[str], typer.Option(help="domain-task; once for each task")],
     presets: Annotated[str, typer.Option(help="presets and stock algorithms, separated by commas")] = "crc,rad,sac",
@@ -67,7 +49,7 @@ def compare(
 
 
 @app.command()
-@_in_one_line
+@in_one_line
 def sweep(
     file: Annotated[Path, typer.Argument(help="YAML file: tasks, seeds, env_steps, variants; see zoo_configs/sweeps")],
     seeds: Annotated[int | None, typer.Option(min=1, help="instead of the file's")] = None,
@@ -87,7 +69,7 @@ def sweep(
 
 
 @app.command()
-@_in_one_line
+@in_one_line
 def evaluate(
     runs: Annotated[list[Path], typer.Argument(help="folders of runs of train.py, or that contain some")],
     episodes: Annotated[int, typer.Option(min=1, help="fresh ones")] = 10,
@@ -104,11 +86,11 @@ def evaluate(
         done = (run.folder / FINAL).exists() and not again
         returns = (read_json(run.folder / FINAL) if done else evaluate_final(run, episodes=episodes))["returns"]
         episodes_range = f"{min(returns):.1f} to {max(returns):.1f}, {len(returns)} episodes"
-        _say(f"{run.folder}: {sum(returns) / len(returns):.1f} ({episodes_range})")
+        say(f"{run.folder}: {sum(returns) / len(returns):.1f} ({episodes_range})")
 
 
 @app.command()
-@_in_one_line
+@in_one_line
 def table(
     which: Annotated[str, typer.Argument(help="100k or 500k: environment steps")],
     sources: Sources,
@@ -127,7 +109,7 @@ def table(
 
 
 @app.command()
-@_in_one_line
+@in_one_line
 def curves(
     sources: Sources,
     output: Annotated[Path, typer.Option("--output", "-o", help="folder for figures and summaries")] = Path("figures"),
@@ -147,13 +129,9 @@ def curves(
     if weights is not None:
         written += draw_weights(scores, output, convex_weights(weights))
     for path in written:
-        _say(str(path))
+        say(str(path))
     for missing in scores.missing:
-        _say(f"missing: {missing}", errors)
-
-
-def _say(line: str, where: Console = console) -> None:
-    where.print(escape(line), soft_wrap=True, highlight=False)  # a path that is to be copied stays on one line
+        say(f"missing: {missing}", errors)
 
 
 def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bool) -> None:
@@ -163,14 +141,12 @@ def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bo
     if dry_run:
         for spec in specs:
             state = "finished" if finished(output / spec.name) else "to run"
-            console.print(
-                escape(f"{output / spec.name}: {spec.agent_steps} agent steps, {state}"), soft_wrap=True, highlight=False
-            )
+            say(f"{output / spec.name}: {spec.agent_steps} agent steps, {state}")
         return
 
     def report(spec: Any, event: str, remark: str) -> None:
         done = sum(finished(output / one.name) for one in specs)
-        _say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
+        say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
 
     try:
         failed = run_specs(specs, output, jobs=jobs, checkpoint_every=checkpoint_every, report=report)
@@ -179,8 +155,8 @@ def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bo
         raise typer.Exit(128 + stopped.signum) from None
     scores = read_scores([output])
     write_scores(scores, output / "scores.csv")
-    _say(f"{output / 'scores.csv'}: {scores.final['run'].nunique()} runs")
+    say(f"{output / 'scores.csv'}: {scores.final['run'].nunique()} runs")
     for missing in scores.missing:
-        _say(f"missing: {missing}", errors)
+        say(f"missing: {missing}", errors)
     if failed:
         raise typer.Exit(1)

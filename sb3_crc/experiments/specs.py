@@ -31,7 +31,7 @@ from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
 
 #: Settings of a configuration that are rl_zoo3's, not the algorithm's
-ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs"}
+ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs", "callback"}
 SWEEP_KEYS = {"tasks", "seeds", "env_steps", "eval_every", "eval_episodes", "variants", "conf_file"}
 
 

@@ -8,6 +8,7 @@ import yaml
 from sb3_crc import PRESETS
 from sb3_crc.configurations import CONFIGS
 from sb3_crc.experiments.specs import compared, convex_weights, read_sweep
+from sb3_crc.objectives import objective_weights
 
 LAPTOP = CONFIGS / "laptop.yml"
 SWEEP = """
@@ -123,6 +124,19 @@ def test_the_convex_weights_of_the_second_ablation() -> None:
     for name, shares in weights.items():
         assert sum(shares) == pytest.approx(1)
         assert [round(100 * share) for share in shares] == pytest.approx([int(part) for part in name.split("-")], abs=1)
+
+
+def test_the_generalisation_ablation_of_the_paper() -> None:
+    for configuration in (None, LAPTOP):
+        specs = read_sweep(CONFIGS / "sweeps" / "ablation_3.yml", conf_file=configuration)
+        assert len({spec.name for spec in specs}) == 4 * 4 * 3
+        for spec in specs:
+            (watched,) = spec.settings["callback"]
+            assert next(iter(watched.values()))["modes"] == ["video_easy", "color_hard"]
+            assert spec.settings["augmentation"] == "random_crop"
+        weights = {spec.method: objective_weights(spec.settings["objectives"]) for spec in specs}
+        assert weights["0-100-0"] == {"reconstruction": 1.0}
+        assert set(weights) == {"33-33-33", "100-0-0", "0-100-0", "0-0-100"}
 
 
 def test_sweep_files_are_plain_yaml() -> None:

@@ -1,0 +1,214 @@
+"""Moving backgrounds: clips from files, resized once and kept on disk, or procedural ones.
+
+F frames, S side of the square picture in pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from sb3_crc.atomic import atomic_write
+
+SUFFIXES = (".mp4", ".npz", ".npy")
+#: Frames of one clip: at 100 x 100 pixels the longest take 300 MB on disk
+SHORTEST, LONGEST = 2, 10_000
+#: Of the files that resized clips are kept in
+FORMAT = 1
+PROCEDURAL_CLIPS = {"video_easy": 10, "video_hard": 100}
+PROCEDURAL_FRAMES = 600
+#: sha256 of DMControl-GB's clips of video_easy; of 3, 4, 5 and 7 it is not known
+ORIGINALS = {
+    "video0": "7cd810b22c9cea030b94a82e392cd5e7f301b084a2ccfe141a180c39d1ae3deb",
+    "video1": "fc348d4f0edb587bf1357a06e6b1fa53599f0e12f2d537f49716b00986edde46",
+    "video2": "10a9cbfbc9cad7b8f4750ebf9a3cf1b97c3006730b85a949995ab49eff48fab0",
+    "video6": "64e9a29ebe6082c60af013ebdd6c3e9a390c9935b2c9a56650bdc685e881aefb",
+    "video8": "240c950b82075254a5668f567c66358faac9c62d1bd4772adbd3596066237d0b",
+    "video9": "c13470e0adca7b34b6961f8202bc0c7d0f1715f55dabfda448546143122cde11",
+}
+UNVERIFIED = ("video3", "video4", "video5", "video7")
+
+
+class Clip(Protocol):
+    """A background of one episode."""
+
+    def __len__(self) -> int: ...
+
+    def frame(self, index: int) -> np.ndarray:
+        """:param index: of F; :return: uint8 ``(S, S, 3)``"""
+        ...
+
+
+class ProceduralClip:
+    """
+    Coloured waves that drift, always the same for the same number and size.
+
+    :param number: which
+    :param side: S
+    """
+
+    def __init__(self, number: int, side: int) -> None:
+        rng = np.random.RandomState(number)
+        along = (np.arange(side, dtype=np.float32) + 0.5) / side
+        self._waves = []
+        for _ in range(4):
+            frequency = rng.uniform(-3, 3, 2).astype(np.float32)
+            turns = rng.randint(1, 6)  # whole ones, so that the clip's end meets its beginning
+            colour = rng.uniform(-1, 1, 3).astype(np.float32)
+            phases = 2 * np.pi * (along[:, None] * frequency[0] + along * frequency[1])
+            self._waves.append((phases + rng.uniform(0, 2 * np.pi), 2 * np.pi * turns / PROCEDURAL_FRAMES, colour))
+        self._base = rng.uniform(64, 192, 3).astype(np.float32)
+
+    def __len__(self) -> int:
+        return PROCEDURAL_FRAMES
+
+    def frame(self, index: int) -> np.ndarray:
+        """:param index: of F; :return: uint8 ``(S, S, 3)``"""
+        waves = (np.sin(phases + speed * index)[..., None] * (48 * colour) for phases, speed, colour in self._waves)
+        picture = self._base + sum(waves)
+        return np.asarray(np.clip(picture, 0, 255), np.uint8)
+
+
+class StoredClip:
+    """
+    A clip of a file, at one size, read from disk as its frames are shown.
+
+    :param path: mp4, or npz or npy with one array uint8 ``(F, height, width, 3)``
+    :param side: S
+    :raises FileNotFoundError: if there is no such file
+    :raises ImportError: for an mp4 without the package ``av`` (extra ``video``)
+    :raises ValueError: naming the file, if it is no clip, or is too short or too long
+    """
+
+    def __init__(self, path: Path, side: int) -> None:
+        self._frames = _resized(path, side)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def frame(self, index: int) -> np.ndarray:
+        """:param index: of F; :return: uint8 ``(S, S, 3)``"""
+        return np.asarray(self._frames[index])
+
+
+def find_clips(folder: Path) -> list[Path]:
+    """
+    :param folder: of clips
+    :return: its clips, video2 before video10
+    :raises FileNotFoundError: if it does not exist
+    :raises ValueError: if it is no folder, or there is no clip in it
+    """
+    if not folder.exists():
+        raise FileNotFoundError(f"there is no folder {folder} of clips")
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder of clips")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    if not found:
+        raise ValueError(f"no clip in {folder}: a clip ends in {', '.join(SUFFIXES)}")
+    return sorted(found, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)])
+
+
+def what_they_are(paths: Sequence[Path]) -> str:
+    """:param paths: of clips for video_easy; :return: for labels: how many are the benchmark's own ten"""
+    own = [path for path in paths if path.suffix.lower() == ".mp4" and _is_original(path)]
+    unverified = sum(path.stem in UNVERIFIED for path in own)
+    if len(own) == len(paths) == 10:
+        return "DMControl-GB's ten clips" + (f", {unverified} by name only" if unverified else "")
+    if len(own) == len(paths):
+        return f"{len(own)} of DMControl-GB's 10 clips"
+    return f"{len(paths)} clips of one's own"
+
+
+def bilinear(picture: np.ndarray, side: int) -> np.ndarray:
+    """
+    The benchmark's resizing, torch's ``interpolate(mode="bilinear", align_corners=False)``: no antialiasing, the aspect ratio
+    is not kept, fractions are cut off.
+
+    :param picture: uint8 ``(height, width, 3)``
+    :param side: S
+    :return: uint8 ``(S, S, 3)``
+    """
+    if picture.shape[:2] == (side, side):
+        return picture
+    (top, bottom, down), (left, right, across) = (_weights(size, side) for size in picture.shape[:2])
+    pixels = picture.astype(np.float32) / 255
+    rows = pixels[top] * (1 - down)[:, None, None] + pixels[bottom] * down[:, None, None]
+    resized = rows[:, left] * (1 - across)[:, None] + rows[:, right] * across[:, None]
+    return np.asarray(resized * 255, np.uint8)
+
+
+def _weights(size: int, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    place = np.maximum((np.arange(side, dtype=np.float32) + 0.5) * np.float32(size / side) - 0.5, 0)
+    first = place.astype(np.int64)
+    return first, np.minimum(first + 1, size - 1), place - first
+
+
+def _is_original(path: Path) -> bool:
+    if path.stem in UNVERIFIED:
+        return True
+    return path.stem in ORIGINALS and hashlib.sha256(path.read_bytes()).hexdigest() == ORIGINALS[path.stem]
+
+
+def _resized(path: Path, side: int) -> np.ndarray:
+    if not path.exists():
+        raise FileNotFoundError(f"there is no clip {path}")
+    about = path.stat()
+    identity = f"{FORMAT} {path.resolve()} {about.st_size} {about.st_mtime_ns} {side}"
+    kept = _cache() / f"{path.stem}-{side}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npy"
+    if not kept.exists():
+        frames = [bilinear(frame, side) for frame in _limited(_decoded(path), path)]
+        if len(frames) < SHORTEST:
+            raise ValueError(f"{path} is too short: {len(frames)} frames; a clip has at least {SHORTEST}")
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(kept) as unfinished, unfinished.open("wb") as file:
+            np.save(file, np.stack(frames))
+    return np.asarray(np.load(kept, mmap_mode="r"))
+
+
+def _cache() -> Path:
+    own = os.environ.get("SB3_CRC_CACHE")
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(own) if own else shared / "sb3_crc" / "clips"
+
+
+def _limited(frames: Iterator[np.ndarray], path: Path) -> Iterator[np.ndarray]:
+    for number, frame in enumerate(frames):
+        if number == LONGEST:
+            raise ValueError(f"{path} is too long: more than {LONGEST} frames; cut it")
+        yield frame
+
+
+def _decoded(path: Path) -> Iterator[np.ndarray]:
+    if path.suffix.lower() == ".mp4":
+        yield from _decoded_video(path)
+        return
+    try:
+        content: Any = np.load(path)
+        if path.suffix.lower() == ".npz":
+            (name,) = content.files
+            content = content[name]
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} is no clip, one array of frames: {error}") from error
+    if content.ndim != 4 or content.shape[3] != 3 or content.dtype != np.uint8 or 0 in content.shape[1:]:
+        raise ValueError(f"{path} holds {content.dtype} {content.shape}; a clip is uint8 (frames, height, width, 3)")
+    yield from content
+
+
+def _decoded_video(path: Path) -> Iterator[np.ndarray]:
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError(f"{path} needs the package av: pip install 'sb3-crc[video]'") from error
+
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+    except (av.FFmpegError, IndexError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as a video: {error}") from error

@@ -1,0 +1,154 @@
+"""Returns where a policy was not trained."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_crc import make_dmc
+from sb3_crc.analysis.generalization import RECORDS, GeneralizationCallback, ModeReturns, generalize, read_records
+from sb3_crc.analysis.generalization_report import Generalization, read_published, write_generalization
+from sb3_crc.analysis.policies import SavedPolicy
+from sb3_crc.evaluation import FIRST_SEED, SEED_STEP
+from sb3_crc.experiments.final import final_returns
+from sb3_crc.experiments.runs import Run
+from tests.analysis.conftest import ENV_KWARGS, NOISE, TASK, make_model, make_run
+
+
+@pytest.fixture
+def policy(runs: dict[str, Path], tmp_path: Path) -> SavedPolicy:
+    """A copy, whose folder may be written to."""
+    folder = tmp_path / "rad" / runs["rad"].name
+    shutil.copytree(runs["rad"], folder, ignore=shutil.ignore_patterns("analysis"))
+    run = Run(folder)
+    return SavedPolicy(run, run.model)
+
+
+def test_where_it_was_trained_the_returns_are_those_of_the_final_score(policy: SavedPolicy) -> None:
+    (result,) = generalize(policy, ["none"], episodes=2)
+    assert result == ModeReturns("none", "none", tuple(final_returns(policy.run, episodes=2)))
+
+
+def test_a_mode_shows_what_it_says(policy: SavedPolicy) -> None:
+    none, colours, video = generalize(policy, ["none", "color_hard", "video_hard"], episodes=2)
+    assert len({none.returns, colours.returns, video.returns}) == 3  # the same initial states, other pictures
+    assert "generated" in colours.label and "procedural" in video.label
+
+
+def test_what_was_measured_is_not_measured_again(policy: SavedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = generalize(policy, ["none", "color_easy"], episodes=1)
+    loads = []
+    load = SavedPolicy.load
+    monkeypatch.setattr(SavedPolicy, "load", lambda self: loads.append(self.file) or load(self))
+    assert generalize(policy, ["color_easy", "none"], episodes=1) == first[::-1]
+    assert loads == []
+    generalize(policy, ["none"], episodes=2)  # other episodes
+    assert len(loads) == 1
+    model = load(policy)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(1.0)
+    model.save(policy.file)
+    generalize(policy, ["none"], episodes=2)  # another model
+    assert len(loads) == 2
+
+
+@pytest.mark.parametrize(
+    ("modes", "message"), [(["video_medium"], "mode 'video_medium'.*video_hard"), ([], "no mode is given")]
+)
+def test_unknown_modes_are_refused(policy: SavedPolicy, modes: Sequence[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        generalize(policy, modes)
+    with pytest.raises(ValueError, match=message):
+        GeneralizationCallback(10, modes)
+
+
+def test_other_environments_are_refused(tmp_path: Path) -> None:
+    run = Run(make_run(tmp_path, "rad", env_id=NOISE, env_kwargs={}, train=0))
+    with pytest.raises(ValueError, match=f"{NOISE}.*only dm_control"):
+        generalize(SavedPolicy(run, run.model))
+
+
+def trained(callback: GeneralizationCallback | None) -> Any:
+    return make_model("rad", 3).learn(60, callback=callback)
+
+
+def test_the_callback_evaluates_and_leaves_the_training_alone(tmp_path: Path) -> None:
+    callback = GeneralizationCallback(990, ["none", "color_hard"], episodes=2, folder=tmp_path)
+    model, plain = trained(callback), trained(None)
+    for one, other in zip(model.policy.parameters(), plain.policy.parameters(), strict=True):
+        assert th.equal(one, other)
+    records = read_records(tmp_path)
+    assert records["timesteps"].tolist() == [25, 50]
+    assert records["none"].shape == records["color_hard"].shape == (2, 2)
+    assert not np.array_equal(records["none"], records["color_hard"])
+
+
+def test_the_callback_has_the_seeds_of_the_other_evaluations(tmp_path: Path) -> None:
+    callback = GeneralizationCallback(60 * 40, ["none"], episodes=2, folder=tmp_path)
+    model = trained(callback)
+    env = DummyVecEnv([lambda: Monitor(make_dmc(TASK, **ENV_KWARGS))])
+    env.seed(FIRST_SEED + SEED_STEP)
+    returns, _ = evaluate_policy(model, env, n_eval_episodes=2, return_episode_rewards=True)
+    assert read_records(tmp_path)["none"].tolist() == [returns]
+
+
+def test_the_callback_refuses_what_it_cannot_distract(tmp_path: Path) -> None:
+    model = make_model("rad", 0, NOISE, {})
+    with pytest.raises(ValueError, match="make_dmc"):
+        model.learn(60, callback=GeneralizationCallback(10, folder=tmp_path))
+    with pytest.raises(ValueError, match="eval_every=0"):
+        GeneralizationCallback(0)
+
+
+def test_unreadable_records_are_named(tmp_path: Path) -> None:
+    assert read_records(tmp_path) == {}
+    (tmp_path / RECORDS).write_bytes(b"no archive")
+    with pytest.raises(ValueError, match=RECORDS):
+        read_records(tmp_path)
+
+
+def named(run: Path) -> SavedPolicy:
+    return SavedPolicy(Run(run), Run(run).model)
+
+
+def test_the_report(runs: dict[str, Path], tmp_path: Path) -> None:
+    def results(none: float, hard: float) -> list[ModeReturns]:
+        return [
+            ModeReturns("none", "none", (none, none)),
+            ModeReturns("video_hard", "video_hard (procedural)", (hard, hard + 2)),
+        ]
+
+    evaluated = [
+        Generalization(named(runs["crc"]), 320, results(100, 49)),
+        Generalization(named(runs["crc_4"]), 320, results(200, 99)),
+        Generalization(named(runs["rad"]), 320, results(80, 19)),
+    ]
+    written = {path.name for path in write_generalization(evaluated, tmp_path)}
+    assert written == {"generalization.csv", "generalization.json", "generalization.md", "generalization.png"}
+    text = (tmp_path / "generalization.md").read_text()
+    assert "| crc | 320 | 2 | 150 ± 71 | 75 ± 35 (50%) |" in text
+    assert "| rad | 320 | 1 | 80 | 20 (25%) |" in text
+    assert "video_hard (procedural)" in text
+    assert len((tmp_path / "generalization.csv").read_text().splitlines()) == 1 + 3 * 2 * 2
+
+
+def test_curves_over_training(runs: dict[str, Path], policy: SavedPolicy, tmp_path: Path) -> None:
+    np.savez(policy.run.folder / RECORDS, timesteps=[25, 50], video_easy=[[1.0, 2.0], [3.0, 4.0]])
+    one = Generalization(policy, 320, [ModeReturns("none", "none", (1.0,))])
+    assert "over_training.png" in {path.name for path in write_generalization([one], tmp_path / "report")}
+
+
+def test_published_scores() -> None:
+    rows = read_published()
+    at = {(row["method"], row["task"], row["mode"]): (row["mean"], row["std"]) for row in rows}
+    assert len(at) == len(rows) == 5 * 8 + 5 * 9 + 5 * 5  # tasks x methods of color_hard, video_easy, video_hard
+    assert at["SODA (conv)", "cartpole-swingup", "video_easy"] == ("474", "143")  # what CRC-RL's table has in its SODA column
+    assert at["SGQN", "finger-spin", "video_hard"] == ("540", "53")
