@@ -1,4 +1,4 @@
-"""Commands that look into saved models: ``sb3-crc latents | tsne | correlate | probe | film``."""
+"""Commands that look into saved models: ``sb3-crc latents | tsne | correlate | probe | film | generalize``."""
 
 import importlib.util
 import time
@@ -122,6 +122,33 @@ def film(
     with _timed("film"):
         written = write_film(subject, output, episode=episode)
     _list(written)
+
+
+@app.command()
+@in_one_line
+def generalize(
+    models: Models,
+    modes: Annotated[
+        str, typer.Option(help="separated by commas; none: where it was trained")
+    ] = "none,color_easy,color_hard,video_easy,video_hard",
+    data: Annotated[
+        Path | None, typer.Option(help="folder with DMControl-GB's color_*.npz and folders video_*; else generated ones")
+    ] = None,
+    evaluation_episodes: Annotated[int, typer.Option("--episodes", min=1, help="of each mode")] = 10,
+    checkpoints: Checkpoints = False,
+    output: Output = Path("generalization"),
+) -> None:
+    """Evaluate policies in distracted environments, beside published scores; curves, where a callback watched a training."""
+    from sb3_crc.analysis.generalization import generalize as evaluate
+    from sb3_crc.analysis.generalization_report import Generalization, write_generalization
+    from sb3_crc.analysis.policies import find_policies
+
+    names = [name.strip() for name in modes.split(",") if name.strip()]
+    evaluated = []
+    for policy in find_policies(models, checkpoints=checkpoints):
+        results = evaluate(policy, names, data=data, episodes=evaluation_episodes, report=say)
+        evaluated.append(Generalization(policy, policy.environment_steps, results))
+    _list(write_generalization(evaluated, output))
 
 
 def _gather(models: Sequence[Path], checkpoints: bool, decisions: int, episodes: int, *, needs: Sequence[str]) -> list[Any]:

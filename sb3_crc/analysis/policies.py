@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.runs import Run, find_runs
@@ -38,6 +39,13 @@ class SavedPolicy:
         if checkpoint is None:
             return f"{name}, {self.file.stem}"
         return f"{name}, {int(checkpoint[1]) * self.run.action_repeat} steps"
+
+    @property
+    def environment_steps(self) -> int:
+        """Of its training until it was saved, as the file says."""
+        data, _, _ = load_from_zip_file(self.file, device="cpu")
+        assert data is not None
+        return int(data["num_timesteps"]) * self.run.action_repeat
 
     def load(self) -> SAC:
         """

@@ -11,11 +11,13 @@ import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from typer.testing import CliRunner
 
 from sb3_crc import make_dmc
 from sb3_crc.analysis.generalization import RECORDS, GeneralizationCallback, ModeReturns, generalize, read_records
 from sb3_crc.analysis.generalization_report import Generalization, read_published, write_generalization
 from sb3_crc.analysis.policies import SavedPolicy
+from sb3_crc.cli import app
 from sb3_crc.evaluation import FIRST_SEED, SEED_STEP
 from sb3_crc.experiments.final import final_returns
 from sb3_crc.experiments.runs import Run
@@ -92,12 +94,12 @@ def test_the_callback_evaluates_and_leaves_the_training_alone(tmp_path: Path) ->
 
 
 def test_the_callback_has_the_seeds_of_the_other_evaluations(tmp_path: Path) -> None:
-    callback = GeneralizationCallback(60 * 40, ["none"], episodes=2, folder=tmp_path)
-    model = trained(callback)
+    trained(GeneralizationCallback(20 * 40, ["none"], episodes=2, folder=tmp_path))
+    model = make_model("rad", 3)  # as it is before it learns anything, at the first evaluation
     env = DummyVecEnv([lambda: Monitor(make_dmc(TASK, **ENV_KWARGS))])
     env.seed(FIRST_SEED + SEED_STEP)
     returns, _ = evaluate_policy(model, env, n_eval_episodes=2, return_episode_rewards=True)
-    assert read_records(tmp_path)["none"].tolist() == [returns]
+    assert read_records(tmp_path)["none"][0].tolist() == returns
 
 
 def test_the_callback_refuses_what_it_cannot_distract(tmp_path: Path) -> None:
@@ -152,3 +154,15 @@ def test_published_scores() -> None:
     assert len(at) == len(rows) == 5 * 8 + 5 * 9 + 5 * 5  # tasks x methods of color_hard, video_easy, video_hard
     assert at["SODA (conv)", "cartpole-swingup", "video_easy"] == ("474", "143")  # what CRC-RL's table has in its SODA column
     assert at["SGQN", "finger-spin", "video_hard"] == ("540", "53")
+
+
+def test_command(runs: dict[str, Path], tmp_path: Path) -> None:
+    command = ["generalize", str(runs["crc"]), str(runs["sac"]), "--modes", "none,video_hard", "--episodes", "1"]
+    result = CliRunner().invoke(app, [*command, "-o", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "generalization.md").read_text()
+    assert "| crc | 1600 | 1 |" in text and "| sac | 1600 | 1 |" in text
+    assert "video_hard (procedural)" in text
+    refused = CliRunner().invoke(app, ["generalize", str(runs["crc"]), "--modes", "video_hrad"])
+    assert refused.exit_code == 2
+    assert "mode 'video_hrad'" in refused.output

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from dm_control import suite
+from dm_control.mujoco import Physics
 from dm_control.suite import common
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -20,6 +21,7 @@ from sb3_crc.envs.distractions import DISTRACTIONS
 from sb3_crc.envs.distractions.chroma import GREEN, green_mask
 from sb3_crc.envs.distractions.clips import PROCEDURAL_FRAMES, ProceduralClip, bilinear, find_clips, what_they_are
 from sb3_crc.envs.distractions.colours import DEFAULT, generated_table
+from sb3_crc.envs.distractions.textures import Scene
 from sb3_crc.envs.tasks import PAPER_TASKS
 
 SMALL: dict[str, Any] = {"image_size": 36, "frame_stack": 2, "render_quality": "fast", "action_repeat": 40}
@@ -359,8 +361,11 @@ def test_arguments_that_cannot_be(kwargs: dict[str, Any], message: str) -> None:
 
 
 def test_a_scene_without_sky_or_floor_is_named() -> None:
-    with pytest.raises(ValueError, match="lqr-lqr_2_1 cannot be distracted: its scene has no"):
-        make_dmc("lqr-lqr_2_1", distraction="color_easy", **SMALL)
+    bare = Physics.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(
+        ValueError, match="own-task cannot be distracted: its scene has no texture 'skybox', no texture 'grid'"
+    ):
+        Scene(bare, "own-task")
 
 
 def test_data_that_are_missing(tmp_path: Path) -> None:

@@ -93,7 +93,10 @@ class Paint:
         self._shade = sky.sum(axis=2, dtype=np.uint16)
         levels = [np.asarray(np.array(DEFAULT[name]) * 255, np.uint8) for name in ("grid_rgb1", "grid_rgb2")]
         self._is_first, self._is_second = ((grid == level).all(axis=2) for level in levels)
-        for edge in (np.s_[[0, -1]], np.s_[:, [0, -1]]):  # marks, which keep their colour: by chance that of the second squares
+        for edge in (
+            np.s_[[0, -1]],
+            np.s_[:, [0, -1]],
+        ):  # marks, which keep their colour: by chance that of the second squares
             self._is_second[edge] = False
 
     def apply(self, colours: Mapping[str, np.ndarray]) -> None:
