@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from matplotlib.image import imread
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -166,3 +167,14 @@ def test_command(runs: dict[str, Path], tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["generalize", str(runs["crc"]), "--modes", "video_hrad"])
     assert refused.exit_code == 2
     assert "mode 'video_hrad'" in refused.output
+
+
+def test_contact_sheet(tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    command = ["contact-sheet", "--tasks", "cartpole-swingup", "--render-quality", "fast", "-o", str(sheet)]
+    result = CliRunner().invoke(app, [*command, "--modes", "color_hard,video_hard"])
+    assert result.exit_code == 0, result.output
+    pixels = (imread(sheet)[..., :3] * 255).astype(int)
+    panels = [pixels[:, side * pixels.shape[1] // 3 : (side + 1) * pixels.shape[1] // 3] for side in range(3)]
+    assert len({int(panel.sum()) for panel in panels}) == 3  # as it is, other colours, a video
+    assert CliRunner().invoke(app, [*command, "--modes", "color_hrad"]).exit_code == 2
