@@ -137,8 +137,8 @@ def bilinear(picture: np.ndarray, side: int) -> np.ndarray:
     if picture.shape[:2] == (side, side):
         return picture
     (top, bottom, down), (left, right, across) = (_weights(size, side) for size in picture.shape[:2])
-    pixels = picture.astype(np.float32) / 255
-    rows = pixels[top] * (1 - down)[:, None, None] + pixels[bottom] * down[:, None, None]
+    upper, lower = (picture[rows].astype(np.float32) / 255 for rows in (top, bottom))
+    rows = upper * (1 - down)[:, None, None] + lower * down[:, None, None]
     resized = rows[:, left] * (1 - across)[:, None] + rows[:, right] * across[:, None]
     return np.asarray(resized * 255, np.uint8)
 
