@@ -17,8 +17,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_crc.analysis.policies import SavedPolicy
-from sb3_crc.analysis.rollouts import FOLDER, sha256
+from sb3_crc.analysis.rollouts import FOLDER
 from sb3_crc.atomic import atomic_write
+from sb3_crc.checkpoints.store import checksum
 from sb3_crc.envs.distractions import DISTRACTIONS
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.envs.tasks import NAMESPACE
@@ -77,7 +78,12 @@ def generalize(
     if not run.arguments["env"].startswith(f"{NAMESPACE}/"):
         raise ValueError(f"{policy.file} was trained in {run.arguments['env']}; only dm_control tasks can be distracted")
     path = run.folder / FOLDER / f"{policy.file.stem}-generalization.json"
-    about = {"model": sha256(policy.file), "env_kwargs": dict(run.env_kwargs), "episodes": episodes, "first_seed": FIRST_SEED}
+    about = {
+        "model": checksum(policy.file),
+        "env_kwargs": dict(run.env_kwargs),
+        "episodes": episodes,
+        "first_seed": FIRST_SEED,
+    }
     known = read_json(path) if path.exists() else {}
     measured: dict[str, Any] = known.get("modes", {}) if {name: known.get(name) for name in about} == about else {}
     model, results = None, []

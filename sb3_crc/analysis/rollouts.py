@@ -23,6 +23,7 @@ from sb3_crc.analysis.networks import BATCH, encode
 from sb3_crc.analysis.physics import physics_state
 from sb3_crc.analysis.policies import SavedPolicy
 from sb3_crc.atomic import atomic_write
+from sb3_crc.checkpoints.store import checksum
 from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.runs import Run
 from sb3_crc.image_spaces import image_key
@@ -106,7 +107,7 @@ def rollout_of(
         "seed": seed,
     }
     written = json.dumps(settings, sort_keys=True, default=str)
-    identity = json.dumps({"settings": written, "model": sha256(policy.file)})
+    identity = json.dumps({"settings": written, "model": checksum(policy.file)})
     key = hashlib.sha256(written.encode()).hexdigest()[:8]  # a model that has changed replaces what its forerunner left
     path = policy.run.folder / FOLDER / f"{policy.file.stem}-{key}.npz"
     rollout = _read(path, identity)
@@ -227,15 +228,6 @@ def _frame_channels(env: gym.Env[Any, Any], images: np.ndarray) -> int:
         return int(env.get_wrapper_attr("frame_channels"))
     except AttributeError:
         return 3 if images.shape[1] % 3 == 0 else 1
-
-
-def sha256(path: Path) -> str:
-    """:param path: a file; :return: of what is in it"""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while part := file.read(1 << 20):
-            digest.update(part)
-    return digest.hexdigest()
 
 
 def _write(rollout: Rollout, path: Path, identity: str) -> None:
