@@ -156,16 +156,15 @@ def generalize(
 def contact_sheet(
     output: Annotated[Path, typer.Option("--output", "-o", help="PNG file")] = Path("contact_sheet.png"),
     tasks: Annotated[str | None, typer.Option(help="separated by commas; else the paper's ten")] = None,
-    modes: Annotated[str | None, typer.Option(help="distractions, separated by commas; else all")] = None,
+    modes: Annotated[str | None, typer.Option(help="distractions, separated by commas; else all that move")] = None,
     data: Annotated[Path | None, typer.Option(help="as of generalize")] = None,
     render_quality: Annotated[str, typer.Option(help="benchmark or fast")] = "benchmark",
 ) -> None:
     """Draw each task under each distraction."""
-    from sb3_crc.analysis.contact_sheet import draw_contact_sheet
-    from sb3_crc.envs.distractions import DISTRACTIONS
+    from sb3_crc.analysis.contact_sheet import MODES, draw_contact_sheet
     from sb3_crc.envs.tasks import PAPER_TASKS
 
-    chosen = [PAPER_TASKS if tasks is None else tasks.split(","), DISTRACTIONS if modes is None else modes.split(",")]
+    chosen = [PAPER_TASKS if tasks is None else tasks.split(","), MODES if modes is None else modes.split(",")]
     _list([draw_contact_sheet(output, *chosen, data=data, render_quality=render_quality)])
 
 

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from sb3_crc.analysis.figures import new_figure
-from sb3_crc.envs.distractions import DISTRACTIONS
+from sb3_crc.envs.distractions import DISTRACTIONS, STATIC
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.envs.tasks import PAPER_TASKS
 
+#: On a picture those that stand still look like those that move
+MODES = tuple(mode for mode in DISTRACTIONS if not mode.endswith(STATIC))
 #: Decisions into the episode, where something has moved
 DECISIONS = 5
 
@@ -19,7 +21,7 @@ DECISIONS = 5
 def draw_contact_sheet(
     path: Path,
     tasks: Sequence[str] = PAPER_TASKS,
-    modes: Sequence[str] = DISTRACTIONS,
+    modes: Sequence[str] = MODES,
     *,
     data: Path | None = None,
     image_size: int = 100,

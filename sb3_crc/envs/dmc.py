@@ -68,7 +68,8 @@ def make_dmc(
         "dict": the stack under "pixels" and each of the task's own observations under its name, float32 (n,)
     :param render_mode: "rgb_array", or None if ``render()`` is not needed
     :param distraction: a test environment: "color_easy", "color_hard", "video_easy" or "video_hard" of DMControl-GB
-        (arXiv 2011.13389), "dcs_easy", "dcs_medium" or "dcs_hard" of the Distracting Control Suite (arXiv 2101.02722).
+        (arXiv 2011.13389), "dcs_easy", "dcs_medium" or "dcs_hard" of the Distracting Control Suite (arXiv 2101.02722), which
+        move, or stand still with the suffix "_static".
         ``env.get_wrapper_attr("distraction_label")`` says what is shown
     :param distraction_data: DMControl-GB's table of colours (.npz, .json, or a folder with ``<distraction>.npz``); for the
         others a folder of clips (.mp4, .npz, .npy), or one that has a folder ``<distraction>``. None: generated colours and

@@ -323,6 +323,23 @@ def test_all_tasks_of_the_paper_can_be_distracted(task: str) -> None:
         env.close()
 
 
+@pytest.mark.parametrize(("mode", "moves"), [("dcs_hard", True), ("dcs_hard_static", False)])
+def test_what_is_static_changes_at_a_reset_only(mode: str, moves: bool) -> None:
+    env = make_dmc("cartpole-swingup", seed=0, distraction=mode, **SMALL)
+
+    def drawn() -> list[np.ndarray]:
+        state = env.get_state()["distraction"]
+        return [np.array(state[name]) for name in ("colours", "pose", "frame")]
+
+    env.reset()
+    first = drawn()
+    for _ in range(3):
+        env.step(np.zeros(1, np.float32))
+    assert all(np.array_equal(*pair) for pair in zip(first, drawn(), strict=True)) == (not moves)
+    env.reset()
+    assert not any(np.array_equal(*pair) for pair in zip(first, drawn(), strict=True))
+
+
 def test_the_camera_of_the_simulator_is_put_back() -> None:
     env = make_dmc("walker-walk", seed=0, distraction="dcs_hard", **SMALL)
     env.reset()

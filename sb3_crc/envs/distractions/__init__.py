@@ -8,7 +8,8 @@ from pathlib import Path
 from sb3_crc.envs.distractions.control_suite import SCALES, ControlSuite
 from sb3_crc.envs.distractions.wrapper import Colours, Distraction, DistractionWrapper, Video
 
-DISTRACTIONS = ("color_easy", "color_hard", "video_easy", "video_hard", *SCALES)
+STATIC = "_static"
+DISTRACTIONS = ("color_easy", "color_hard", "video_easy", "video_hard", *SCALES, *(f"{mode}{STATIC}" for mode in SCALES))
 """Values of :func:`~sb3_crc.make_dmc`'s ``distraction``."""
 MASKS = ("chroma", "segmentation")
 
@@ -31,8 +32,10 @@ def make_distraction(
     :raises ValueError: naming the file, if ``data`` is not what the mode needs
     """
     path = None if data is None else Path(data).expanduser()
-    if mode in SCALES:
-        return ControlSuite(mode, path, domain=domain, camera_id=camera_id, action_repeat=action_repeat)
+    scale = mode.removesuffix(STATIC)
+    if scale in SCALES:
+        dynamic = scale == mode
+        return ControlSuite(scale, path, domain=domain, camera_id=camera_id, action_repeat=action_repeat, dynamic=dynamic)
     if mode.startswith("color"):
         return Colours(mode, path)
     if mode == "video_easy" and domain == "reacher":
