@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Space
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.distractions import DISTRACTIONS, MASKS, DistractionWrapper, make_distraction
+from sb3_crc.envs.distractions import DISTRACTIONS, MASKS, DistractionWrapper
 from sb3_crc.envs.simulator import LARGE_PICTURE, Action, Observation, SimulatorStep, StepResult, load_simulator
 from sb3_crc.envs.state import State, check_state
 from sb3_crc.envs.tasks import default_action_repeat, default_camera, split_task
@@ -70,7 +70,7 @@ def make_dmc(
     :param distraction: a test environment: "color_easy", "color_hard", "video_easy" or "video_hard" of DMControl-GB
         (arXiv 2011.13389), "dcs_easy", "dcs_medium" or "dcs_hard" of the Distracting Control Suite (arXiv 2101.02722), which
         move, or stand still with the suffix "_static".
-        ``env.get_wrapper_attr("distraction_label")`` says what is shown
+        ``env.get_wrapper_attr("distraction_label")`` says what is shown; a warning, if nothing is (reacher's "video_easy")
     :param distraction_data: DMControl-GB's table of colours (.npz, .json, or a folder with ``<distraction>.npz``); for the
         others a folder of clips (.mp4, .npz, .npy), or one that has a folder ``<distraction>``. None: generated colours and
         clips, which are not the benchmark's
@@ -81,6 +81,7 @@ def make_dmc(
     :raises ValueError: for an unknown task or a value that is not allowed, with the nearest one that is; for data of a
         distraction that cannot be used, naming the file
     :raises FileNotFoundError: if these data are missing
+    :raises ImportError: for an mp4 without the package ``av``, of the extra ``video``
     :raises RenderingUnavailable: if pixels are wanted and no OpenGL back end can draw
     """
     domain, subtask = split_task(task)
@@ -111,25 +112,26 @@ def make_dmc(
     if np.any(env.action_space.low != -1.0) or np.any(env.action_space.high != 1.0):  # type: ignore[attr-defined]
         env = gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
     env = gym.wrappers.RepeatAction(env, action_repeat)
+    data = None if distraction_data is None else str(distraction_data)
     distracted: DistractionWrapper | None = None
     if distraction is not None:
-        differs = make_distraction(
+        env = distracted = DistractionWrapper(
+            env,
             distraction,
-            distraction_data,
+            data,
             distraction_mask,
-            domain=domain,
-            image_size=image_size,
-            camera_id=camera_id,
-            action_repeat=action_repeat,
+            task=task,
+            image_size=int(image_size),
+            camera_id=int(camera_id),
+            action_repeat=int(action_repeat),
+            seed=seed,
         )
-        env = distracted = DistractionWrapper(env, differs, task)
     settings = {"task": task, "observation": observation, "action_repeat": int(action_repeat)}
     made: DecisionEnv
     if has_pictures:
         pictures = {"image_size": int(image_size), "frame_stack": int(frame_stack), "camera_id": int(camera_id)}
         settings |= {**pictures, "render_quality": render_quality}
         if distraction is not None:
-            data = None if distraction_data is None else str(distraction_data)
             settings |= {"distraction": distraction, "distraction_data": data, "distraction_mask": distraction_mask}
         env = gym.wrappers.AddRenderObservation(env, render_only=observation == "pixels", render_key=IMAGE_KEY)
         stack = PixelStack if observation == "pixels" else DictStack

@@ -8,7 +8,10 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,18 +24,7 @@ SUFFIXES = (".mp4", ".npz", ".npy")
 SHORTEST, LONGEST = 2, 10_000
 #: Of the files that resized clips are kept in
 FORMAT = 1
-PROCEDURAL_CLIPS = {"video_easy": 10, "video_hard": 100}
 PROCEDURAL_FRAMES = 600
-#: sha256 of DMControl-GB's clips of video_easy; of 3, 4, 5 and 7 it is not known
-ORIGINALS = {
-    "video0": "7cd810b22c9cea030b94a82e392cd5e7f301b084a2ccfe141a180c39d1ae3deb",
-    "video1": "fc348d4f0edb587bf1357a06e6b1fa53599f0e12f2d537f49716b00986edde46",
-    "video2": "10a9cbfbc9cad7b8f4750ebf9a3cf1b97c3006730b85a949995ab49eff48fab0",
-    "video6": "64e9a29ebe6082c60af013ebdd6c3e9a390c9935b2c9a56650bdc685e881aefb",
-    "video8": "240c950b82075254a5668f567c66358faac9c62d1bd4772adbd3596066237d0b",
-    "video9": "c13470e0adca7b34b6961f8202bc0c7d0f1715f55dabfda448546143122cde11",
-}
-UNVERIFIED = ("video3", "video4", "video5", "video7")
 
 
 class Clip(Protocol):
@@ -97,6 +89,11 @@ class StoredClip:
         return np.asarray(self._frames[index])
 
 
+def clips_of(data: Path, mode: str) -> list[Path]:
+    """:param data: a folder of clips, or one that has a folder of the mode's name; :return: as :func:`find_clips`"""
+    return find_clips(data / mode if (data / mode).is_dir() else data)
+
+
 def find_clips(folder: Path) -> list[Path]:
     """
     :param folder: of clips
@@ -108,21 +105,10 @@ def find_clips(folder: Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder {folder} of clips")
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder of clips")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
     if not found:
         raise ValueError(f"no clip in {folder}: a clip ends in {', '.join(SUFFIXES)}")
     return sorted(found, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)])
-
-
-def what_they_are(paths: Sequence[Path]) -> str:
-    """:param paths: of clips for video_easy; :return: for labels: how many are the benchmark's own ten"""
-    own = [path for path in paths if path.suffix.lower() == ".mp4" and _is_original(path)]
-    unverified = sum(path.stem in UNVERIFIED for path in own)
-    if len(own) == len(paths) == 10:
-        return "DMControl-GB's ten clips" + (f", {unverified} by name only" if unverified else "")
-    if len(own) == len(paths):
-        return f"{len(own)} of DMControl-GB's 10 clips"
-    return f"{len(paths)} clips of one's own"
 
 
 def bilinear(picture: np.ndarray, side: int) -> np.ndarray:
@@ -149,26 +135,36 @@ def _weights(size: int, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, np.minimum(first + 1, size - 1), place - first
 
 
-def _is_original(path: Path) -> bool:
-    if path.stem in UNVERIFIED:
-        return True
-    return path.stem in ORIGINALS and hashlib.sha256(path.read_bytes()).hexdigest() == ORIGINALS[path.stem]
-
-
 def _resized(path: Path, side: int) -> np.ndarray:
     if not path.exists():
         raise FileNotFoundError(f"there is no clip {path}")
     about = path.stat()
     identity = f"{FORMAT} {path.resolve()} {about.st_size} {about.st_mtime_ns} {side}"
     kept = _cache() / f"{path.stem}-{side}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npy"
-    if not kept.exists():
-        frames = [bilinear(frame, side) for frame in _limited(_decoded(path), path)]
-        if len(frames) < SHORTEST:
-            raise ValueError(f"{path} is too short: {len(frames)} frames; a clip has at least {SHORTEST}")
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(kept) as unfinished, unfinished.open("wb") as file:
-            np.save(file, np.stack(frames))
+    with suppress(OSError, ValueError, EOFError):  # there is none, or the disk was full when it was written
+        return np.asarray(np.load(kept, mmap_mode="r"))
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(kept) as unfinished:
+        _write(_decoded(path), side, unfinished, path)
     return np.asarray(np.load(kept, mmap_mode="r"))
+
+
+def _write(frames: Iterator[np.ndarray], side: int, target: Path, path: Path) -> None:
+    """Resize and write frame by frame: memory holds one of them, whatever the clip's length."""
+    header = {"descr": "|u1", "fortran_order": False, "shape": (0, side, side, 3)}
+    with target.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        start, number = file.tell(), 0
+        for frame in frames:
+            number += 1
+            if number > LONGEST:
+                raise ValueError(f"{path} is too long: more than {LONGEST} frames; cut it, for instance into several clips")
+            file.write(bilinear(frame, side).tobytes())
+        if number < SHORTEST:
+            raise ValueError(f"{path} is too short: {number} frames; a clip has at least {SHORTEST}")
+        file.seek(0)
+        np.lib.format.write_array_header_1_0(file, {**header, "shape": (number, side, side, 3)})
+        assert file.tell() == start  # NumPy leaves room for a longer first axis
 
 
 def _cache() -> Path:
@@ -177,23 +173,18 @@ def _cache() -> Path:
     return Path(own) if own else shared / "sb3_crc" / "clips"
 
 
-def _limited(frames: Iterator[np.ndarray], path: Path) -> Iterator[np.ndarray]:
-    for number, frame in enumerate(frames):
-        if number == LONGEST:
-            raise ValueError(f"{path} is too long: more than {LONGEST} frames; cut it")
-        yield frame
-
-
 def _decoded(path: Path) -> Iterator[np.ndarray]:
     if path.suffix.lower() == ".mp4":
         yield from _decoded_video(path)
         return
     try:
-        content: Any = np.load(path)
-        if path.suffix.lower() == ".npz":
-            (name,) = content.files
-            content = content[name]
-    except (OSError, ValueError, EOFError) as error:
+        content: Any = np.load(path, mmap_mode="r")
+        if isinstance(content, np.lib.npyio.NpzFile):
+            with content:
+                if len(content.files) != 1:
+                    raise ValueError(f"it holds {len(content.files)} arrays: {', '.join(content.files)}")
+                content = content[content.files[0]]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is no clip, one array of frames: {error}") from error
     if content.ndim != 4 or content.shape[3] != 3 or content.dtype != np.uint8 or 0 in content.shape[1:]:
         raise ValueError(f"{path} holds {content.dtype} {content.shape}; a clip is uint8 (frames, height, width, 3)")

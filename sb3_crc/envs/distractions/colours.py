@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,55 @@ ORIGINAL = {
 }
 
 Table = Mapping[str, np.ndarray]
+
+
+class Colours:
+    """
+    DMControl-GB's color_easy and color_hard: at each reset ``RandomState(seed).randint`` draws one of a table's entries.
+
+    :param mode: which
+    :param data: a table, see :func:`read_table`; None: the generated one
+    """
+
+    visible = True
+
+    def __init__(self, mode: str, data: Path | None) -> None:
+        self._table, what = (generated_table(mode), "generated") if data is None else read_table(data, mode)
+        self.label = f"{mode} ({what})"
+        self._paint: tuple[Scene, Paint] | None = None
+        self._entry = 0
+        self.restart(None)
+
+    def restart(self, seed: int | None) -> None:
+        """:param seed: of the draws"""
+        self._rng = np.random.RandomState(seed)
+
+    def begin(self, scene: Scene) -> None:
+        """Draw colours; they stay for the episode."""
+        self._entry = int(self._rng.randint(len(self._table["self_rgb"])))
+        self._apply(scene)
+
+    def advance(self) -> None:
+        """Nothing moves."""
+
+    def draw(self, render: Callable[..., np.ndarray], **settings: Any) -> np.ndarray:
+        """:return: the picture as it is: the scene has the colours"""
+        return render(**settings)
+
+    def get_state(self) -> dict[str, Any]:
+        """:return: the entry, and where the draws stand"""
+        return {"label": self.label, "entry": self._entry, "random": self._rng.get_state(legacy=False)}
+
+    def set_state(self, state: dict[str, Any], scene: Scene) -> None:
+        """:param state: of :meth:`get_state`; :param scene: is painted"""
+        self._rng.set_state(state["random"])
+        self._entry = state["entry"]
+        self._apply(scene)
+
+    def _apply(self, scene: Scene) -> None:
+        if self._paint is None or self._paint[0] is not scene:
+            self._paint = scene, Paint(scene)
+        self._paint[1].apply({name: values[self._entry] for name, values in self._table.items()})
 
 
 def generated_table(mode: str) -> Table:
@@ -66,7 +117,7 @@ def read_table(path: Path, mode: str) -> tuple[Table, str]:
         if isinstance(content, list):  # one mapping per entry
             content = {name: [entry[name] for entry in content] for name in DEFAULT}
         table = {name: np.array(content[name], np.float64) for name in DEFAULT}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{found} is no table of colours with {', '.join(DEFAULT)}: {error!r}") from error
     for name, values in table.items():
         if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(table["self_rgb"]) or not len(values):
@@ -74,8 +125,8 @@ def read_table(path: Path, mode: str) -> tuple[Table, str]:
         if not ((values >= 0) & (values <= 1)).all():  # NaN too
             raise ValueError(f"{found}: {name} has values outside [0, 1]")
     numbers = np.concatenate([table[name].ravel() for name in DEFAULT]).round(6)
-    original = hashlib.sha256(numbers.astype("<f8").tobytes()).hexdigest() == ORIGINAL[mode]
-    return table, "DMControl-GB's table" if original else f"table {found.name}"
+    digest = hashlib.sha256(numbers.astype("<f8").tobytes()).hexdigest()
+    return table, "DMControl-GB's table" if digest == ORIGINAL[mode] else f"table {found.name}, {digest[:8]}"
 
 
 class Paint:
@@ -93,11 +144,8 @@ class Paint:
         self._shade = sky.sum(axis=2, dtype=np.uint16)
         levels = [np.asarray(np.array(DEFAULT[name]) * 255, np.uint8) for name in ("grid_rgb1", "grid_rgb2")]
         self._is_first, self._is_second = ((grid == level).all(axis=2) for level in levels)
-        for edge in (
-            np.s_[[0, -1]],
-            np.s_[:, [0, -1]],
-        ):  # marks, which keep their colour: by chance that of the second squares
-            self._is_second[edge] = False
+        # The marks at its edge keep their colour, which by chance is that of the second squares
+        self._is_second[[0, -1]] = self._is_second[:, [0, -1]] = False
 
     def apply(self, colours: Mapping[str, np.ndarray]) -> None:
         """:param colours: RGB in [0, 1] by the names of :data:`DEFAULT`"""

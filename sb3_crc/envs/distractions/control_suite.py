@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_crc.envs.distractions.clips import Clip, ProceduralClip, StoredClip, bilinear, find_clips
+from sb3_crc.envs.distractions.clips import Clip, ProceduralClip, StoredClip, bilinear, clips_of
+from sb3_crc.envs.distractions.labels import what_they_are
 from sb3_crc.envs.distractions.textures import GRID, SKYBOX, Scene
 
 #: beta, the scale of camera and colours
@@ -41,33 +42,33 @@ class ControlSuite:
     :param dynamic: False: what a reset draws stays for the episode
     """
 
+    visible = True
+
     def __init__(
         self, mode: str, data: Path | None, *, domain: str, camera_id: int, action_repeat: int, dynamic: bool = True
     ) -> None:
         if camera_id < 0:
             raise ValueError(f"{mode} moves one of the task's cameras; camera_id={camera_id} is MuJoCo's free camera")
-        self._scale, self._clips = SCALES[mode], CLIPS[mode]
-        self._paths = None if data is None else find_clips(data / mode if (data / mode).is_dir() else data)[: self._clips]
-        what = "procedural" if self._paths is None else f"{len(self._paths)} clips"
-        self.label = f"{mode} ({what}{'' if dynamic else ', static'})"
-        self._count = self._clips if self._paths is None else len(self._paths)
+        self._scale = SCALES[mode]
+        self._paths = None if data is None else clips_of(data, mode)[: CLIPS[mode]]
+        self._count = CLIPS[mode] if self._paths is None else len(self._paths)
         for path in self._paths or ():  # now, so that a broken clip is not found out after hours
             StoredClip(path, SKY_SIDE)
+        what = "procedural" if self._paths is None else what_they_are(self._paths, mode)
+        self.label = f"{mode} ({what}{'' if dynamic else ', static'})"
         self._floor_alpha = FLOOR_ALPHA.get(domain, OTHER_FLOOR_ALPHA)
         self._from_above = domain == "reacher"
         self._camera, self._repeat, self._dynamic = camera_id, action_repeat, dynamic
         self._scene: Scene | None = None
         self._clip: Clip | None = None
-        self._base = np.zeros((0, 3))
-        self._begun = False
+        self._base = self._colours = np.zeros((0, 3))
+        self._pose, self._velocity = np.zeros(4), np.zeros(4)  # horizontal, vertical (rad), radius (log), roll (rad)
+        self._clip_number, self._frame, self._direction = 0, 0, 1
         self.restart(None)
 
     def restart(self, seed: int | None) -> None:
         """:param seed: of everything that is drawn"""
         self._rng = np.random.RandomState(seed)
-        self._colours = np.zeros_like(self._base)
-        self._pose, self._velocity = np.zeros(4), np.zeros(4)  # horizontal, vertical (rad), radius (log), roll (rad)
-        self._clip_number, self._frame, self._direction = 0, 0, 1
 
     def begin(self, scene: Scene) -> None:
         """Draw camera, colours, clip, its first frame and direction."""
@@ -79,7 +80,6 @@ class ControlSuite:
         self._load_clip()
         self._frame = int(rng.randint(len(self._require_clip())))
         self._direction = int(rng.choice((-1, 1)))
-        self._begun = True
         self._show(scene)
 
     def advance(self) -> None:
@@ -92,7 +92,7 @@ class ControlSuite:
 
     def draw(self, render: Render, **settings: Any) -> np.ndarray:
         """:return: the picture through the camera where it is now; the simulator's own camera is put back"""
-        if self._scene is None or not self._begun:
+        if self._scene is None:
             return np.asarray(render(**settings))
         data = self._scene.physics.data
         own = data.cam_xpos[self._camera].copy(), data.cam_xmat[self._camera].copy()
@@ -105,13 +105,13 @@ class ControlSuite:
     def get_state(self) -> State:
         """:return: everything that was drawn, and where the draws stand"""
         return {
+            "label": self.label,
             "colours": self._colours.copy(),
             "pose": self._pose.copy(),
             "velocity": self._velocity.copy(),
             "clip": self._clip_number,
             "frame": self._frame,
             "direction": self._direction,
-            "begun": self._begun,
             "random": self._rng.get_state(legacy=False),
         }
 
@@ -121,16 +121,14 @@ class ControlSuite:
         self._rng.set_state(state["random"])
         self._colours, self._pose, self._velocity = (state[name].copy() for name in ("colours", "pose", "velocity"))
         self._clip_number, self._frame, self._direction = state["clip"], state["frame"], state["direction"]
-        self._begun = state["begun"]
-        if self._begun:
-            self._load_clip()
-            self._show(scene)
+        self._load_clip()
+        self._show(scene)
 
     def _enter(self, scene: Scene) -> None:
         if self._scene is scene:
             return
         self._scene = scene
-        self._base = np.array(scene.physics.model.mat_rgba[:, :3])
+        self._base = np.array(scene.physics.model.mat_rgba[:, :3], np.float64)
         scene.physics.model.mat_rgba[scene.material(GRID), 3] = self._floor_alpha
         scene.shrink_skybox(SKY_SIDE)
 
@@ -180,9 +178,8 @@ class ControlSuite:
 
     def _position_and_target(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         data = scene.physics.data
-        return data.cam_xpos[self._camera].copy(), self._target(
-            data.cam_xpos[self._camera], data.cam_xmat[self._camera], scene
-        )
+        position, orientation = data.cam_xpos[self._camera].copy(), data.cam_xmat[self._camera]
+        return position, self._target(position, orientation, scene)
 
     def _target(self, position: np.ndarray, orientation: np.ndarray, scene: Scene) -> np.ndarray:
         """What the camera looks at: the point of its line of sight that is nearest to the scene's centre of mass."""

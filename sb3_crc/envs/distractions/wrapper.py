@@ -5,187 +5,15 @@ S side of the picture in pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol
+import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.distractions.chroma import GREEN, green_mask
-from sb3_crc.envs.distractions.clips import (
-    PROCEDURAL_CLIPS,
-    Clip,
-    ProceduralClip,
-    StoredClip,
-    bilinear,
-    find_clips,
-    what_they_are,
-)
-from sb3_crc.envs.distractions.colours import Paint, Table, generated_table, read_table
-from sb3_crc.envs.distractions.textures import GRID, SKYBOX, Scene
-
-Render = Callable[..., np.ndarray]
-State = dict[str, Any]
-
-
-class Distraction(Protocol):
-    """What differs from the environment of the training."""
-
-    label: str
-
-    def begin(self, scene: Scene) -> None:
-        """An episode begins; its task has been initialised."""
-
-    def advance(self) -> None:
-        """A decision has been carried out."""
-
-    def draw(self, render: Render, **settings: Any) -> np.ndarray:
-        """:param render: of dm_control's Physics; :param settings: of it; :return: uint8 ``(height, width, 3)``"""
-
-    def restart(self, seed: int | None) -> None:
-        """Be as good as new, with this seed."""
-
-    def get_state(self) -> State:
-        """Arrays, strings and numbers on which what follows depends."""
-
-    def set_state(self, state: State, scene: Scene) -> None:
-        """:param state: of :meth:`get_state`; :param scene: to be changed accordingly"""
-
-
-class Colours:
-    """
-    DMControl-GB's color_easy and color_hard: at each reset ``RandomState(seed).randint`` draws one of a table's entries.
-
-    :param mode: which
-    :param data: a table, see :func:`~sb3_crc.envs.distractions.colours.read_table`; None: the generated one
-    """
-
-    def __init__(self, mode: str, data: Path | None) -> None:
-        self._table: Table
-        self._table, what = (generated_table(mode), "generated") if data is None else read_table(data, mode)
-        self.label = f"{mode} ({what})"
-        self._paint: tuple[Scene, Paint] | None = None
-        self._entry = -1
-        self.restart(None)
-
-    def restart(self, seed: int | None) -> None:
-        """:param seed: of the draws"""
-        self._rng = np.random.RandomState(seed)
-
-    def begin(self, scene: Scene) -> None:
-        """Draw colours; they stay for the episode."""
-        self._entry = int(self._rng.randint(len(self._table["self_rgb"])))
-        self._apply(scene)
-
-    def advance(self) -> None:
-        """Nothing moves."""
-
-    def draw(self, render: Render, **settings: Any) -> np.ndarray:
-        """:return: the picture as it is: the scene has the colours"""
-        return render(**settings)
-
-    def get_state(self) -> State:
-        """:return: the entry, and where the draws stand"""
-        return {"entry": self._entry, "random": self._rng.get_state(legacy=False)}
-
-    def set_state(self, state: State, scene: Scene) -> None:
-        """:param state: of :meth:`get_state`; :param scene: is painted"""
-        self._rng.set_state(state["random"])
-        self._entry = state["entry"]
-        if self._entry >= 0:
-            self._apply(scene)
-
-    def _apply(self, scene: Scene) -> None:
-        if self._paint is None or self._paint[0] is not scene:
-            self._paint = scene, Paint(scene)
-        self._paint[1].apply({name: values[self._entry] for name, values in self._table.items()})
-
-
-class Video:
-    """
-    DMControl-GB's video_easy (behind the scene) and video_hard (in place of the floor too).
-
-    The k-th episode shows clip k, counted from 1 and modulo their number, from its first frame, one frame per decision.
-
-    :param mode: which
-    :param data: folder of clips, or one that has a folder of the mode's name; None: procedural clips
-    :param side: S
-    :param mask: "chroma": sky (and floor) are painted green and what looks green is replaced, as in the benchmark;
-        "segmentation": what MuJoCo says is background (or floor) is replaced, at the cost of a second, cheap rendering
-    """
-
-    def __init__(self, mode: str, data: Path | None, side: int, mask: str) -> None:
-        self._replaced = (SKYBOX, GRID) if mode == "video_hard" else (SKYBOX,)
-        self._side = side
-        self._chroma = mask == "chroma"
-        self._paths: list[Path] | None = None
-        what = "procedural"
-        self._count = PROCEDURAL_CLIPS[mode]
-        if data is not None:
-            self._paths = find_clips(data / mode if (data / mode).is_dir() else data)
-            self._count = len(self._paths)
-            what = what_they_are(self._paths) if mode == "video_easy" else f"{self._count} clips"
-            for path in self._paths:  # now, so that a broken clip is not found out after hours
-                StoredClip(path, side)
-        self.label = f"{mode} ({what}{'' if self._chroma else ', segmentation'})"
-        self._scene: Scene | None = None
-        self._clip: Clip | None = None
-        self.restart(None)
-
-    def restart(self, seed: int | None) -> None:
-        """Nothing is drawn by lot: ``seed`` changes nothing."""
-        self._episode, self._frame = 0, 0
-
-    def begin(self, scene: Scene) -> None:
-        """The next clip, from its beginning."""
-        self._episode += 1
-        self._frame = 0
-        self._show(scene)
-
-    def advance(self) -> None:
-        """The next frame, or the first one after the last."""
-        self._frame += 1
-
-    def draw(self, render: Render, **settings: Any) -> np.ndarray:
-        """:return: the picture with the clip's frame behind it"""
-        picture = np.array(render(**settings))
-        if self._clip is None:
-            return picture
-        mask = green_mask(picture) if self._chroma else self._segmented(render, settings)
-        background = bilinear(self._clip.frame(self._frame % len(self._clip)), picture.shape[0])
-        np.copyto(picture, background, where=mask[..., None])
-        return picture
-
-    def get_state(self) -> State:
-        """:return: where clips and frames stand"""
-        return {"episode": self._episode, "frame": self._frame}
-
-    def set_state(self, state: State, scene: Scene) -> None:
-        """:param state: of :meth:`get_state`; :param scene: is painted"""
-        self._episode, self._frame = state["episode"], state["frame"]
-        if self._episode > 0:
-            self._show(scene)
-
-    def _show(self, scene: Scene) -> None:
-        number = self._episode % self._count
-        self._clip = ProceduralClip(number, self._side) if self._paths is None else StoredClip(self._paths[number], self._side)
-        if self._scene is not scene:
-            self._scene = scene
-            for name in self._replaced if self._chroma else ():
-                scene.texture(name)[...] = GREEN
-                scene.upload(name)
-
-    def _segmented(self, render: Render, settings: dict[str, Any]) -> np.ndarray:
-        assert self._scene is not None
-        flagless = {name: value for name, value in settings.items() if name != "render_flag_overrides"}
-        geoms = render(**flagless, segmentation=True)[..., 0]
-        mask = geoms == -1
-        if GRID in self._replaced:
-            floors = np.flatnonzero(self._scene.physics.model.geom_matid == self._scene.material(GRID))
-            mask |= np.isin(geoms, floors)
-        return np.asarray(mask)
+from sb3_crc.envs.distractions.modes import State, make_distraction
+from sb3_crc.envs.distractions.textures import Scene
 
 
 class DistractionWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -193,16 +21,40 @@ class DistractionWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     Distract an environment of :func:`~sb3_crc.make_dmc`: outside the repeat of actions, inside the stack of frames.
 
     :param env: whose ``render`` takes the picture of an observation
-    :param distraction: what differs
-    :param task: for messages
+    :param mode: of :data:`~sb3_crc.envs.distractions.modes.DISTRACTIONS`
+    :param data: table of colours or folder of clips; None: generated ones
+    :param mask: of :data:`~sb3_crc.envs.distractions.modes.MASKS`
+    :param task: "domain-task"
+    :param image_size: S
+    :param camera_id: of the picture
+    :param action_repeat: simulator steps per decision
+    :param seed: of what is drawn
+    :raises FileNotFoundError: if ``data`` is missing
+    :raises ImportError: for an mp4 without the package ``av``
+    :raises ValueError: naming the file, if ``data`` is not what the mode needs, or if the task cannot be distracted
     """
 
-    def __init__(self, env: gym.Env[Any, Any], distraction: Distraction, task: str) -> None:
-        RecordConstructorArgs.__init__(self, distraction=distraction, task=task)
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        mode: str,
+        data: str | None = None,
+        mask: str = "chroma",
+        *,
+        task: str,
+        image_size: int,
+        camera_id: int,
+        action_repeat: int,
+        seed: int | None = None,
+    ) -> None:
+        settings: dict[str, Any] = {"task": task, "image_size": image_size, "camera_id": camera_id}
+        settings["action_repeat"] = action_repeat
+        RecordConstructorArgs.__init__(self, mode=mode, data=data, mask=mask, seed=seed, **settings)
         super().__init__(env)
-        self._distraction = distraction
-        self._task = task
+        self._mode, self._task = mode, task
         self._scene = Scene(self.get_wrapper_attr("physics"), task)
+        self._distraction = make_distraction(mode, data, mask, **settings)
+        self._distraction.restart(seed)
 
     @property
     def distraction_label(self) -> str:
@@ -210,7 +62,14 @@ class DistractionWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         return self._distraction.label
 
     def await_reset(self, seed: int | None) -> None:
-        """Take the resets so far as not done. :param seed: of the next one, unless it brings its own"""
+        """
+        Take the resets and pictures so far as those of the construction.
+
+        :param seed: of the next reset, unless it brings its own
+        """
+        if not self._distraction.visible:
+            what = f"{self._mode} changes nothing of {self._task}"
+            warnings.warn(f"{what}: nothing that it replaces is in the first picture", stacklevel=3)
         self._distraction.restart(seed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
