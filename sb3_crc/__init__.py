@@ -3,7 +3,12 @@
 from importlib.metadata import version
 
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
-from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
+from sb3_crc.callbacks import (
+    AuxiliaryLossCallback,
+    NStepScheduleCallback,
+    ObjectiveScheduleCallback,
+    ReconstructionImageCallback,
+)
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.decoder import PixelDecoder
@@ -22,6 +27,7 @@ __all__ = [
     "CRCPolicy",
     "DictFrameReplayBuffer",
     "FrameReplayBuffer",
+    "NStepScheduleCallback",
     "ObjectiveScheduleCallback",
     "PixelDecoder",
     "PixelEncoder",

@@ -21,6 +21,7 @@ from typing_extensions import Self
 
 from sb3_crc.augmentations import center_crop
 from sb3_crc.auxiliary import AuxiliaryLearner, AuxiliarySettings, read_aux
+from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import scale_pixels
 from sb3_crc.extractors import trainable_extractor
@@ -310,6 +311,59 @@ class ObjectiveScheduleCallback(BaseCallback):
         model._objective_weights = {**model._objective_weights, **values}
         for name, value in values.items():
             self.logger.record(f"representation/{name}_weight", value)
+
+
+class NStepScheduleCallback(BaseCallback):
+    """
+    Change over how many rewards the returns of a :class:`~sb3_crc.buffers.FrameReplayBuffer` sum as training proceeds.
+
+    Long returns carry rewards back quickly while the critic knows nothing, but old policies' actions are in them; short ones
+    have no such bias (annealed as in BBF, arXiv 2305.19452). After ``learn()`` the buffer has its own number again.
+
+    :param n_steps: share of the training that is done, from 0 to below 1 -> number of rewards from there on, at least 1; until
+        the first share the buffer's own number stays
+    :param verbose: as in SB3
+    :raises ValueError: for an empty mapping or one with other keys or values; when ``learn()`` begins, if the model's replay
+        buffer is none of ours
+    """
+
+    def __init__(self, n_steps: Mapping[float, int], *, verbose: int = 0):
+        super().__init__(verbose)
+        if not n_steps:
+            raise ValueError("n_steps={}: nothing to schedule")
+        for share, number in n_steps.items():
+            if not 0 <= share < 1:
+                raise ValueError(f"n_steps={dict(n_steps)}: {share!r} is no share of the training, from 0 to below 1")
+            if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+                raise ValueError(f"n_steps={dict(n_steps)}: {number!r} must be a whole number, at least 1")
+        self.n_steps = dict(sorted(n_steps.items()))
+
+    def _init_callback(self) -> None:
+        buffer = getattr(self.model, "replay_buffer", None)
+        if not isinstance(buffer, FrameReplayBuffer):
+            raise ValueError(f"NStepScheduleCallback needs a FrameReplayBuffer, the model has {type(buffer).__name__}")
+
+    def _on_training_start(self) -> None:
+        self._own = self._buffer.n_steps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:  # right before train()
+        done = 1 - self.model._current_progress_remaining
+        for share, number in self.n_steps.items():
+            if done >= share:
+                self._buffer.n_steps = number
+        self.logger.record("train/n_steps", self._buffer.n_steps)
+
+    def _on_training_end(self) -> None:
+        self._buffer.n_steps = self._own
+
+    @property
+    def _buffer(self) -> FrameReplayBuffer:
+        buffer = self.model.replay_buffer  # type: ignore[attr-defined]
+        assert isinstance(buffer, FrameReplayBuffer)
+        return buffer
 
 
 def _checked_crcsac(model: BaseAlgorithm, callback: str) -> CRCSAC:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -104,6 +104,9 @@ def ladder(
     error: Annotated[list[float] | None, typer.Option(help="of what is read off a frame, in metres, rung seen")] = None,
     n_steps: Annotated[list[int] | None, typer.Option(help="of the returns, rung seen")] = None,
     target_entropy: Annotated[float, typer.Option(help="of the policy, rung seen")] = -1.0,
+    falling_rates: Annotated[bool, typer.Option("--falling-rates", help="learning rates that end at 0, rung seen")] = False,
+    agent_steps: Annotated[int, typer.Option(min=600, help="of each training, rung seen")] = 7_500,
+    evaluations: Annotated[int, typer.Option(min=1, help="of each training, rung seen")] = 6,
     seed: int = 0,
 ) -> None:
     """Measure what must work before learning from pixels can."""
@@ -115,8 +118,10 @@ def ladder(
     if rung == "state":
         measured: object = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
     elif rung == "seen":
+        shared: dict[str, Any] = {"target_entropy": target_entropy, "falling_rates": falling_rates}
+        shared |= {"agent_steps": agent_steps, "evaluations": evaluations, "seed": seed}
         measured = [
-            rungs.seen_state_sac(task, error=one, n_steps=steps, target_entropy=target_entropy, seed=seed)
+            rungs.seen_state_sac(task, error=one, n_steps=steps, **shared)
             for one in error or [0.0]
             for steps in n_steps or [1]
         ]

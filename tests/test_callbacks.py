@@ -25,7 +25,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTrans
 from torch import nn
 
 from sb3_crc import PixelEncoder
-from sb3_crc.callbacks import AuxiliaryLossCallback, ObjectiveScheduleCallback, ReconstructionImageCallback
+from sb3_crc.callbacks import (
+    AuxiliaryLossCallback,
+    NStepScheduleCallback,
+    ObjectiveScheduleCallback,
+    ReconstructionImageCallback,
+)
 from sb3_crc.objectives import AuxiliaryObjective
 from sb3_crc.views import Views
 from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
@@ -763,3 +768,39 @@ def test_objective_schedule_refusals() -> None:
         make_model(objectives={}).learn(1, callback=ObjectiveScheduleCallback(encoder_learning_rate=1e-3))
     with pytest.raises(ValueError, match="ObjectiveScheduleCallback is for CRCSAC, got SAC"):
         stock().learn(1, callback=ObjectiveScheduleCallback({"contrastive": 1.0}))
+
+
+# -- NStepScheduleCallback ---------------------------------------------------------------------------------------------
+
+
+def test_returns_get_shorter_as_training_proceeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model(n_steps=3, learning_starts=8, batch_size=4, gamma=0.5)
+    seen = []
+    sample = model.replay_buffer.sample_frames
+
+    def spied(*args: Any, **kwargs: Any) -> Any:
+        batch = sample(*args, **kwargs)
+        seen.append((model.num_timesteps, 1.0 if batch.discounts is None else float(batch.discounts.min())))
+        return batch
+
+    monkeypatch.setattr(model.replay_buffer, "sample_frames", spied)
+    model.learn(40, callback=NStepScheduleCallback({0.75: 1, 0.5: 2}))
+    expected = [(3, 0.125) if step < 20 else (2, 0.25) if step < 30 else (1, 1.0) for step, _ in seen]
+    assert [discount for _, discount in seen] == [discount for _, discount in expected]
+    assert {number for number, _ in expected} == {1, 2, 3}
+    assert model.replay_buffer.n_steps == 3  # its own again
+    assert model.logger.name_to_value["train/n_steps"] == 1
+
+
+def test_n_step_schedule_refusals() -> None:
+    for steps, message in (
+        ({}, "nothing to schedule"),
+        ({1.0: 2}, "1.0 is no share of the training, from 0 to below 1"),
+        ({-0.1: 2}, "-0.1 is no share"),
+        ({0.5: 0}, "0 must be a whole number, at least 1"),
+        ({0.5: 1.5}, "1.5 must be a whole number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            NStepScheduleCallback(steps)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="needs a FrameReplayBuffer, the model has ReplayBuffer"):
+        stock().learn(1, callback=NStepScheduleCallback({0.5: 1}))

@@ -8,6 +8,8 @@ N frames, B batch, Z latent, S state.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +18,7 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
-from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from torch import nn
 
@@ -26,6 +28,7 @@ from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.experiments.seen_positions import SeenPositions
+from sb3_crc.schedules import lr_schedule
 
 #: SB3's SAC from states, with the replay ratio of the laptop class
 STATE_SAC = {"learning_rate": 1e-3, "learning_starts": 500, "gradient_steps": 2, "tau": 0.01}
@@ -74,6 +77,7 @@ def seen_state_sac(
     error: float,
     n_steps: int = 1,
     target_entropy: float = -1.0,
+    falling_rates: bool = False,
     agent_steps: int = 7_500,
     evaluations: int = 6,
     episodes: int = 10,
@@ -86,6 +90,7 @@ def seen_state_sac(
     :param error: of what is read off a frame, in metres: :class:`~sb3_crc.experiments.seen_positions.SeenPositions`
     :param n_steps: of the return
     :param target_entropy: of the policy
+    :param falling_rates: learning rates fall linearly to 0 over the run
     :param agent_steps: decisions to train for
     :param evaluations: how often it is evaluated, at equal distances
     :param episodes: fresh ones of each evaluation, with the policy's mean
@@ -97,28 +102,32 @@ def seen_state_sac(
     settings = {**STATE_SAC, "ent_coef": "auto_0.1", "n_steps": n_steps, "target_entropy": target_entropy, "batch_size": 128}
     heads = {"net_arch": [256, 256], "activation_fn": lambda: nn.Sequential(nn.LayerNorm(256), nn.ReLU())}
     scaled = TransformReward(env, lambda reward: 0.1 * float(reward))
-    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **settings)  # type: ignore[arg-type]
+    rate: Any = lr_schedule("lin_0.001") if falling_rates else settings["learning_rate"]
+    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **{**settings, "learning_rate": rate})  # type: ignore[arg-type]
     curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
-    settings |= {"reward_scale": 0.1, "error": error}
+    settings |= {"reward_scale": 0.1, "error": error, "falling_rates": falling_rates}
     return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
 
 
 def _learning_curve(
     model: SAC, fresh: gym.Env[Any, Any], agent_steps: int, evaluations: int, episodes: int, action_repeat: int
 ) -> list[dict[str, float]]:
-    curve = []
-    for evaluation in range(evaluations):
-        model.learn(agent_steps // evaluations, reset_num_timesteps=evaluation == 0)
-        returns, _ = evaluate_policy(model, fresh, n_eval_episodes=episodes, return_episode_rewards=True)
-        curve.append(
-            {
-                "environment_steps": model.num_timesteps * action_repeat,
-                "mean": float(np.mean(returns)),
-                "std": float(np.std(returns, ddof=1)),
-                "min": float(np.min(returns)),
-            }
+    with TemporaryDirectory() as folder:
+        evaluation = EvalCallback(
+            fresh, eval_freq=agent_steps // evaluations, n_eval_episodes=episodes, log_path=folder, verbose=0
         )
-    return curve
+        model.learn(agent_steps, callback=evaluation)
+        with np.load(Path(folder) / "evaluations.npz") as evaluated:
+            measured = list(zip(evaluated["timesteps"], evaluated["results"], strict=True))
+    return [
+        {
+            "environment_steps": int(agent_step) * action_repeat,
+            "mean": float(np.mean(returns)),
+            "std": float(np.std(returns, ddof=1)),
+            "min": float(np.min(returns)),
+        }
+        for agent_step, returns in measured
+    ]
 
 
 def probe_random_encoder(
