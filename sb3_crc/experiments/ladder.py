@@ -103,7 +103,7 @@ def seen_state_sac(
     heads = {"net_arch": [256, 256], "activation_fn": lambda: nn.Sequential(nn.LayerNorm(256), nn.ReLU())}
     scaled = TransformReward(env, lambda reward: 0.1 * float(reward))
     rate: Any = lr_schedule("lin_0.001") if falling_rates else settings["learning_rate"]
-    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **{**settings, "learning_rate": rate})  # type: ignore[arg-type]
+    model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **{**settings, "learning_rate": rate})
     curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
     settings |= {"reward_scale": 0.1, "error": error, "falling_rates": falling_rates}
     return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
