@@ -134,6 +134,24 @@ def curves(
         say(f"missing: {missing}", errors)
 
 
+@app.command()
+@in_one_line
+def report(
+    sources: Annotated[list[Path], typer.Argument(help="runs, folders that contain runs and figures, CSV files of scores")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="file to write")] = Path("report.html"),
+    title: Annotated[str | None, typer.Option(help="of the page; else the names of what it is about")] = None,
+) -> None:
+    """One page about runs, to be opened in a browser: tables, curves, instruments, settings, films, commands."""
+    from sb3_crc.experiments.report.page import write_report
+
+    if lacking := [name for name in ("plotly", "rliable") if importlib.util.find_spec(name) is None]:
+        raise ValueError(f"report needs {' and '.join(lacking)}: pip install 'sb3-crc[analysis]'")
+    left_out = write_report(sources, output, title=title)
+    say(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+    for one in left_out:
+        say(f"left out, the page would have become too large: {one}", errors)
+
+
 def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bool) -> None:
     from sb3_crc.experiments.pool import Stopped, finished, run_specs
     from sb3_crc.experiments.scores import read_scores, write_scores

@@ -126,7 +126,7 @@ def paper_table(scores: Scores, table: str, *, allow_mixed: bool = False) -> Pap
     """
     cells = published(table)
     final = scores.final
-    _check_whole(final)
+    check_whole(final)
     if not allow_mixed:
         _check_budgets(final, table)
     one_protocol(final, allow_mixed=allow_mixed)
@@ -166,7 +166,8 @@ def render(table: PaperTable, format: str) -> str:
 # What stands in the table
 
 
-def _check_whole(final: "pd.DataFrame") -> None:
+def check_whole(final: "pd.DataFrame") -> None:
+    """:param final: rows of final policies; :raises ValueError: if the evaluation of a run is not whole"""
     for run, rows in final.groupby("run"):
         lacking = len(rows) != rows["episodes"].iloc[0]
         if lacking or rows["return"].isna().any():
@@ -177,7 +178,7 @@ def _check_whole(final: "pd.DataFrame") -> None:
 def _check_budgets(final: "pd.DataFrame", table: str) -> None:
     others = []
     for (task, budget), rows in final.groupby(["task", "budget"], sort=False):
-        if not any(_same_steps(budget, allowed) for allowed in _budgets(table, task)):
+        if not any(same_steps(budget, allowed) for allowed in allowed_budgets(table, task)):
             others.append(f"{', '.join(dict.fromkeys(rows['method']))} on {task}: {budget:,}")
     if others:
         allowed = f"{STEPS[table][0]:,} environment steps"
@@ -189,11 +190,13 @@ def _check_budgets(final: "pd.DataFrame", table: str) -> None:
         )
 
 
-def _budgets(table: str, task: str) -> tuple[int, ...]:
+def allowed_budgets(table: str, task: str) -> tuple[int, ...]:
+    """:param table: 100k or 500k; :return: environment steps of the runs that may stand in it"""
     return STEPS[table] if task in HARDER_TASKS else STEPS[table][:1]
 
 
-def _same_steps(budget: float, steps: float) -> bool:
+def same_steps(budget: float, steps: float) -> bool:
+    """:return: whether two numbers of environment steps are the same, but for a remainder"""
     return math.isclose(budget, steps, rel_tol=1e-3)  # a budget is a whole number of decisions
 
 
@@ -260,7 +263,7 @@ def _published_mean(curl: Mapping[str, PublishedScore], task: str, budgets: tupl
     if task not in curl:
         return None
     parts = SIX_TASKS if task == SIX_TASK_MEAN else (task,)
-    same = all(_same_steps(budget, curl[part].environment_steps or 0) for part in parts for budget in budgets)
+    same = all(same_steps(budget, curl[part].environment_steps or 0) for part in parts for budget in budgets)
     return curl[task].mean if same else None
 
 
@@ -339,7 +342,7 @@ def _known(seeds: Any) -> int | None:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """Cells as text, the first column naming the row; ``names``: how many columns do so"""
 
     title: str
@@ -348,7 +351,8 @@ class _Grid:
     names: int
 
 
-def _grids(table: PaperTable) -> list[_Grid]:
+def grids(table: PaperTable) -> list[Grid]:
+    """:param table: of :func:`paper_table`; :return: the table itself and, with scores of ours, these in detail"""
     header = ["task", *table.published, *(f"ours: {method}" for method in table.ours)]
     rows = [
         [
@@ -358,11 +362,11 @@ def _grids(table: PaperTable) -> list[_Grid]:
         ]
         for row in table.rows
     ]
-    grids = [_Grid(f"Return after {table.name} environment steps", header, rows, 1)]
+    grids = [Grid(f"Return after {table.name} environment steps", header, rows, 1)]
     if table.ours:
         header = ["task", "ours", "seeds", "mean", "std", "IQM", "lowest", "highest", "over our curl", "over published CURL"]
         rows = [[row, method, *_detail_cells(of[row])] for row in table.rows for method, of in table.ours.items() if row in of]
-        grids.append(_Grid("Ours in detail", header, rows, 2))
+        grids.append(Grid("Ours in detail", header, rows, 2))
     return grids
 
 
@@ -386,7 +390,7 @@ def _our_cell(table: str, score: OurScore | None) -> str:
 
 def _other_steps(table: str, steps: Sequence[int]) -> str:
     """Says so in the cell itself if it is not after as many steps as the title says."""
-    if all(_same_steps(one, STEPS[table][0]) for one in steps):
+    if all(same_steps(one, STEPS[table][0]) for one in steps):
         return ""
     return f" at {' and '.join(f'{one / 1000:g}k' for one in steps)}"
 
@@ -408,7 +412,7 @@ def _text(table: PaperTable) -> str:
     from rich.text import Text
 
     console = Console(file=io.StringIO(), width=10_000, color_system=None)  # a row is one line, however long
-    for grid in _grids(table):
+    for grid in grids(table):
         shown = Table(box=box.SIMPLE, title=Text(grid.title), title_justify="left")
         for index, name in enumerate(grid.header):  # as Text: in a string, [K=2,M=2] would be markup
             shown.add_column(Text(name), justify="left" if index < grid.names else "right", no_wrap=True)
@@ -426,7 +430,7 @@ def _text(table: PaperTable) -> str:
 
 def _markdown(table: PaperTable) -> str:
     blocks = []
-    for grid in _grids(table):
+    for grid in grids(table):
         marks = [":--" if index < grid.names else "--:" for index in range(len(grid.header))]
         rows = [_markdown_row(row) for row in (grid.header, marks, *grid.rows)]
         blocks += [f"**{grid.title}**", "\n".join(rows)]
@@ -442,7 +446,7 @@ def _markdown_row(cells: Iterable[str]) -> str:
 
 def _latex(table: PaperTable) -> str:
     lines = [r"% needs \usepackage{booktabs}"]
-    for grid in _grids(table):
+    for grid in grids(table):
         lines += [
             rf"\paragraph{{{_escaped(grid.title)}}}",
             "",
