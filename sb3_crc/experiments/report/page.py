@@ -24,7 +24,7 @@ from sb3_crc.experiments.report.contents import (
     run_media,
 )
 from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, read_scores
-from sb3_crc.experiments.statistics import curve, training_runs
+from sb3_crc.experiments.statistics import Axis, curve, training_runs
 from sb3_crc.experiments.tables import Grid, allowed_budgets, check_whole, grids, paper_table, same_steps
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 LARGEST = 15_000_000
 #: Okabe and Ito's colours, which those see apart who see some colours alike, then tab10's
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b", "#9467bd", "#bcbd22")
-AXES = ("environment_steps", "seconds")
+AXES: tuple[Axis, ...] = ("environment_steps", "seconds")
 #: Bootstrap samples of a curve's interval
 REPS = 500
 
@@ -63,11 +63,11 @@ def write_report(sources: Sequence[Path], output: Path, *, title: str | None = N
     colours = {method: COLOURS[number % len(COLOURS)] for number, method in enumerate(methods)}
     title = title or ", ".join(source.name or str(source) for source in sources)
 
-    data = {"colours": colours, "tasks": _curves(scores.table), "instruments": _instruments(contents)}
-    tasks = [task["name"] for task in data["tasks"]]  # type: ignore[index, union-attr]
+    tasks = _curves(scores.table)
+    data = {"colours": colours, "tasks": tasks, "instruments": _instruments(contents)}
     sections = {
         "Scores": _scores(scores),
-        "Curves": _curves_section(tasks),
+        "Curves": _curves_section(len(tasks)),
         "Instruments": _instruments_section(contents),
         "Settings": _settings_section(contents),
         "Runs and machines": _runs_section(contents),
@@ -170,10 +170,10 @@ def _instruments(contents: Iterable[RunContents]) -> list[dict[str, Any]]:
     ]
 
 
-def _curves_section(tasks: Sequence[str]) -> str:
+def _curves_section(tasks: int) -> str:
     if not tasks:
         return "<p>No run has been evaluated during training.</p>"
-    charts = "".join(f'<div class="chart" id="curves-{index}"></div>' for index in range(len(tasks)))
+    charts = "".join(f'<div class="chart" id="curves-{index}"></div>' for index in range(tasks))
     return (
         '<div class="controls"><button data-axis="environment_steps" aria-pressed="true">environment steps</button>'
         '<button data-axis="seconds" aria-pressed="false">hours</button>'
