@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_crc.console import errors, in_one_line, say
+from sb3_crc.console import console, errors, in_one_line, say
 
 app = typer.Typer()
 
@@ -150,6 +150,41 @@ def report(
     say(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
     for one in left_out:
         say(f"left out, the page would have become too large: {one}", errors)
+
+
+@app.command()
+@in_one_line
+def watch(
+    runs: Annotated[list[Path], typer.Argument(help="runs of train.py, or folders that contain some")],
+    every: Annotated[float, typer.Option(min=0.5, help="seconds between two looks")] = 5.0,
+    once: Annotated[bool, typer.Option("--once", help="Look once; so it is too where the output is no terminal.")] = False,
+) -> None:
+    """Progress, returns, instruments and time left of runs while they train; ends when all have ended, or with Ctrl-C."""
+    import time
+
+    from rich.live import Live
+
+    from sb3_crc.experiments.runs import find_runs
+    from sb3_crc.experiments.watching import Progress, progress_table, read_progress
+
+    def look() -> list[Progress]:
+        found = [read_progress(run) for run in find_runs(runs)]
+        if not found:
+            raise FileNotFoundError(f"no run of train.py in {', '.join(map(str, runs))}")
+        return found
+
+    progresses = look()
+    if once or not console.is_terminal:
+        console.print(progress_table(progresses))
+        return
+    with Live(progress_table(progresses), console=console, auto_refresh=False) as live:
+        try:
+            while any(one.status in ("unfinished", "silent") for one in progresses):
+                time.sleep(every)
+                progresses = look()
+                live.update(progress_table(progresses), refresh=True)
+        except KeyboardInterrupt:
+            return
 
 
 def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bool) -> None:
