@@ -1,16 +1,18 @@
 """What is said of runs while they train."""
 
+import io
 import os
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
 from sb3_crc.experiments.runs import find_runs
-from sb3_crc.experiments.watching import Progress, read_progress, sparkline
+from sb3_crc.experiments.watching import Progress, progress_table, read_progress, sparkline
 from tests.experiments.test_report import STEPS, make_run
 
 HEADER = "time/total_timesteps,time/time_elapsed,train/critic_loss,eval/q_bias"
@@ -74,12 +76,20 @@ def test_a_sparkline_rises_with_its_values() -> None:
     assert sparkline(list(np.linspace(-1, 1, 50)), width=3)[-1] == "█" and len(sparkline([1] * 50)) == 20
 
 
-def test_the_command_shows_several_runs_and_all_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+def test_the_table_has_a_line_for_each_run(tmp_path: Path) -> None:
+    make_run(tmp_path, "crc", 0)
+    make_run(tmp_path, "rad", 1, ended=False)
+    console = Console(width=200, file=io.StringIO())
+    console.print(progress_table([read_progress(run) for run in find_runs([tmp_path])]))
+    assert isinstance(console.file, io.StringIO)
+    shown = console.file.getvalue()
+    assert "crc, cartpole-swingup, seed 0" in shown and "rad, cartpole-swingup, seed 1" in shown and "final 801" in shown
+
+
+def test_the_command_says_how_far_all_are(tmp_path: Path) -> None:
     make_run(tmp_path, "crc", 0)
     make_run(tmp_path, "rad", 1, ended=False)
     result = CliRunner().invoke(app, ["watch", str(tmp_path), "--once"])
-    assert result.exit_code == 0 and "1 of 2 runs ended, 100% of all decisions made" in result.output
-    assert "crc, cartpole-swingup, seed 0" in result.output and "final 801" in result.output
+    assert result.exit_code == 0 and "1 of 2 runs ended" in result.output
     missing = CliRunner().invoke(app, ["watch", str(tmp_path / "nowhere")])
     assert missing.exit_code == 2 and "nowhere is no folder" in missing.output.replace("\n", "")
