@@ -12,9 +12,15 @@ app = typer.Typer()
 
 Sources = Annotated[list[Path], typer.Argument(help="folders that contain runs, or CSV files of scores")]
 Mixed = Annotated[bool, typer.Option("--allow-mixed", help="Let scores of different protocols stand in one table.")]
-Jobs = Annotated[int, typer.Option(min=1, help="runs at once; each gets its share of the cores")]
+Engine = Annotated[str, typer.Option(help="local, ray or slurm")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="runs at once; else as many as cores, memory and GPU allow")]
+Address = Annotated[str | None, typer.Option(help="of a Ray cluster, host:port or auto; else Ray runs on this machine")]
+Cpus = Annotated[int | None, typer.Option(min=1, help="ray, slurm: cores of each run; else one")]
+Gpus = Annotated[float | None, typer.Option(min=0, help="ray, slurm: GPUs of each run; Ray shares one: 0.25")]
+Memory = Annotated[float | None, typer.Option(min=0.1, help="ray, slurm: gigabytes of each run; else what is measured")]
+Slurm = Annotated[list[str] | None, typer.Option(help="NAME=VALUE of submitit: partition=gpu, account=..., timeout_min=240")]
 Every = Annotated[int, typer.Option(min=1, help="agent steps between two checkpoints of a run")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs and what state they are in; start nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs, their state, hours, memory and disk; start none.")]
 
 
 @app.command()
@@ -29,7 +35,13 @@ def compare(
     eval_episodes: Annotated[int, typer.Option(min=1, help="of each evaluation")] = 10,
     conf_file: Annotated[Path | None, typer.Option(help="configuration of all; else zoo_configs/<preset>.yml")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="folder of the runs and of scores.csv")] = Path("comparison"),
-    jobs: Jobs = 1,
+    engine: Engine = "local",
+    jobs: Jobs = None,
+    address: Address = None,
+    cpus: Cpus = None,
+    gpus: Gpus = None,
+    memory: Memory = None,
+    slurm: Slurm = None,
     checkpoint_every: Every = 1_000,
     dry_run: DryRun = False,
 ) -> None:
@@ -45,7 +57,8 @@ def compare(
         eval_episodes=eval_episodes,
         conf_file=conf_file,
     )
-    _run(specs, output, jobs, checkpoint_every, dry_run)
+    how = {"engine": engine, "jobs": jobs, "address": address, "cpus": cpus, "gpus": gpus, "memory": memory, "slurm": slurm}
+    _run(specs, output, dry_run, checkpoint_every=checkpoint_every, **how)
 
 
 @app.command()
@@ -56,7 +69,13 @@ def sweep(
     env_steps: Annotated[int | None, typer.Option(min=1, help="instead of the file's")] = None,
     conf_file: Annotated[Path | None, typer.Option(help="instead of the file's, for instance zoo_configs/laptop.yml")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="folder of the runs and of scores.csv")] = Path("sweep"),
-    jobs: Jobs = 1,
+    engine: Engine = "local",
+    jobs: Jobs = None,
+    address: Address = None,
+    cpus: Cpus = None,
+    gpus: Gpus = None,
+    memory: Memory = None,
+    slurm: Slurm = None,
     checkpoint_every: Every = 1_000,
     dry_run: DryRun = False,
 ) -> None:
@@ -65,7 +84,8 @@ def sweep(
 
     conf_file = None if conf_file is None else conf_file.absolute()
     specs = read_sweep(file, seeds=seeds, env_steps=env_steps, conf_file=conf_file)
-    _run(specs, output, jobs, checkpoint_every, dry_run)
+    how = {"engine": engine, "jobs": jobs, "address": address, "cpus": cpus, "gpus": gpus, "memory": memory, "slurm": slurm}
+    _run(specs, output, dry_run, checkpoint_every=checkpoint_every, **how)
 
 
 @app.command()
@@ -187,24 +207,23 @@ def watch(
             return
 
 
-def _run(specs: Any, output: Path, jobs: int, checkpoint_every: int, dry_run: bool) -> None:
-    from sb3_crc.experiments.pool import Stopped, finished, run_specs
+def _run(specs: Any, output: Path, dry_run: bool, **how: Any) -> None:
+    from sb3_crc.experiments.campaign import Campaign, describe, execute, parse_assignments
+    from sb3_crc.experiments.engines.local import Stopped
     from sb3_crc.experiments.scores import read_scores, write_scores
 
+    campaign = Campaign(**how | {"slurm": parse_assignments(how["slurm"] or [], "--slurm")})
     if dry_run:
-        for spec in specs:
-            state = "finished" if finished(output / spec.name) else "to run"
-            say(f"{output / spec.name}: {spec.agent_steps} agent steps, {state}")
+        for line in describe(specs, output, campaign):
+            say(line)
         return
-
-    def report(spec: Any, event: str, remark: str) -> None:
-        done = sum(finished(output / one.name) for one in specs)
-        say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
-
     try:
-        failed = run_specs(specs, output, jobs=jobs, checkpoint_every=checkpoint_every, report=report)
+        failed = execute(specs, output, campaign)
     except Stopped as stopped:
-        errors.print("Stopped; the same command goes on.")
+        slurm = campaign.engine == "slurm"
+        errors.print(
+            "Stopped. " + ("The jobs go on, and the same command waits for them." if slurm else "The same command goes on.")
+        )
         raise typer.Exit(128 + stopped.signum) from None
     scores = read_scores([output])
     write_scores(scores, output / "scores.csv")

@@ -9,7 +9,6 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.provenance import provenance
 from sb3_crc.experiments.runs import FINAL, Run, write_json
@@ -72,8 +71,7 @@ def evaluate_final(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED
         "returns": _returns(model, run, episodes, seed),
         "evaluated": provenance(),
     }
-    with atomic_write(run.folder / FINAL) as unfinished:
-        write_json(final, unfinished)
+    write_json(final, run.folder / FINAL)
     return final
 
 

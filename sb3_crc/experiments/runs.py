@@ -20,6 +20,7 @@ from typing import Any
 
 import yaml
 
+from sb3_crc.atomic import atomic_write
 from sb3_crc.envs.tasks import NAMESPACE, default_action_repeat, task_of
 
 FINAL, PROVENANCE, SPEC, FAILURE = "final.json", "provenance.json", "spec.json", "failure.json"
@@ -180,5 +181,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:
-    """:param content: plain data; :param path: file to write"""
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    """:param content: plain data; :param path: file to write, which appears whole or not at all"""
+    with atomic_write(path) as unfinished:
+        unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -35,6 +35,14 @@ ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs", "callback"}
 SWEEP_KEYS = {"tasks", "seeds", "env_steps", "eval_every", "eval_episodes", "variants", "conf_file"}
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """Of two variants of one name YAML itself would silently drop the first."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        _check_unique(f"keys{node.start_mark}", [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)])
+        return super().construct_mapping(node, deep)  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True)
 class RunSpec:
     """
@@ -119,6 +127,7 @@ def compared(
     :return: a run for each of task, seed and preset, in this order, so that what is compared comes together
     :raises ValueError: for unknown names or values that cannot work, before anything runs
     """
+    _check_unique("presets", presets)
     variants = {preset: {"preset": preset} for preset in presets}
     protocol = {"env_steps": env_steps, "eval_every": eval_every, "eval_episodes": eval_episodes}
     return _grid(variants, tasks, seeds, conf_file=conf_file, **protocol)
@@ -132,7 +141,10 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
     :raises FileNotFoundError: if it is missing
     :raises ValueError: naming file and key, for what is no sweep
     """
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), _UniqueKeys)  # a SafeLoader
+    except yaml.YAMLError as error:
+        raise ValueError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{file} is no sweep: it must be a mapping with {', '.join(sorted(SWEEP_KEYS))}")
     content |= {name: value for name, value in overrides.items() if value is not None}
@@ -167,6 +179,13 @@ def convex_weights(file: Path) -> dict[str, tuple[float, float, float]]:
     return found
 
 
+def _check_unique(name: str, values: Sequence[Any]) -> None:
+    """:raises ValueError: naming what is there twice"""
+    twice = [value for place, value in enumerate(values) if value in values[:place]]
+    if twice:
+        raise ValueError(f"{name}: {twice[0]!r} is there twice")
+
+
 def _grid(
     variants: Mapping[str, Mapping[str, Any]],
     tasks: Iterable[str],
@@ -176,11 +195,15 @@ def _grid(
     **protocol: Any,
 ) -> list[RunSpec]:
     tasks, seeds = list(tasks), list(seeds)
-    for name, values in (("tasks", tasks), ("seeds", seeds), ("variants", variants)):
+    named: dict[str, Sequence[Any]] = {"tasks": tasks, "seeds": seeds, "variants": list(variants)}
+    for name, values in named.items():
         if not values:
             raise ValueError(f"{name} is empty: there is nothing to run")
+        _check_unique(name, values)
     resolved = {}
     for method, changes in variants.items():
+        if not str(method).strip(" .") or set(str(method)) & set("/\\\0"):
+            raise ValueError(f"variant {method!r}: its name becomes that of a folder, so there can be no slash in it")
         overrides = dict(changes)
         preset = overrides.pop("preset", method)
         check_name(f"preset of {method!r}", preset, [*PRESETS, *STOCK])

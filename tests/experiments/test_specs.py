@@ -99,6 +99,27 @@ def test_mistakes_are_named_before_anything_runs(file: Path, old: str, new: str,
         read_sweep(file)
 
 
+@pytest.mark.parametrize(
+    ("addition", "message"),
+    [
+        ("variants: {crc: {}, rad: {}, crc: {batch_size: 8}}", "'crc' is there twice"),
+        ("tasks: [walker-walk, walker-walk]", "tasks: 'walker-walk' is there twice"),
+        ("seeds: [0, 1, 0]", "seeds: 0 is there twice"),
+        ("variants: {a/b: {preset: crc}}", "'a/b': its name becomes that of a folder"),
+        ("variants: {..: {preset: crc}}", "'..': its name becomes that of a folder"),
+    ],
+)
+def test_names_that_would_hide_runs(tmp_path: Path, addition: str, message: str) -> None:
+    lines = {"env_steps": "1600", "tasks": "[cartpole-swingup]", "seeds": "1", "variants": "{crc: {}}"}
+    key, _, value = addition.partition(": ")
+    path = tmp_path / "sweep.yml"
+    path.write_text("".join(f"{name}: {own}\n" for name, own in {**lines, key: value}.items()))
+    with pytest.raises(ValueError, match=message):
+        read_sweep(path)
+    with pytest.raises(ValueError, match="presets: 'crc' is there twice"):
+        compared(["crc", "rad", "crc"], ["cartpole-swingup"], [0], env_steps=1600, eval_every=800)
+
+
 def test_the_ablations_of_the_paper() -> None:
     for configuration in (None, LAPTOP):
         first = read_sweep(CONFIGS / "sweeps" / "ablation_1.yml", conf_file=configuration)

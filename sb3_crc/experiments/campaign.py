@@ -1,0 +1,227 @@
+"""A comparison from its plan to its scores: what it needs, which engine executes it, how far it is."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sb3_crc.atomic import atomic_write
+from sb3_crc.console import console, errors, say
+from sb3_crc.experiments.engines.execution import finished
+from sb3_crc.experiments.engines.local import run_locally, threads_each, usable_cores
+from sb3_crc.experiments.needs import Needs, check_disk, measure_needs, most_at_once, seconds_for_all
+from sb3_crc.experiments.runs import find_runs
+from sb3_crc.experiments.specs import RunSpec
+from sb3_crc.experiments.watching import Progress, progress_table, read_progress
+from sb3_crc.memory import GIGABYTE
+from sb3_crc.settings import check_name
+
+ENGINES = ("local", "ray", "slurm")
+#: Options that only some engines have
+OWN_OPTIONS = {
+    "jobs": ("local", "slurm"),
+    "address": ("ray",),
+    "cpus": ("ray", "slurm"),
+    "gpus": ("ray", "slurm"),
+    "memory": ("ray", "slurm"),
+    "slurm": ("slurm",),
+}
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """
+    How a comparison is executed. None leaves a choice to the engine.
+
+    :param engine: one of :data:`ENGINES`
+    :param jobs: runs at once; None: as many as cores, memory and GPU allow
+    :param address: of a Ray cluster; None: this machine
+    :param cpus: cores of each run; None: one
+    :param gpus: of each run; Ray shares one that is given in fractions
+    :param memory: gigabytes of each run; None: what is measured
+    :param slurm: parameters of submitit's SlurmExecutor, and ``cluster``
+    :param checkpoint_every: agent steps between two checkpoints of a run
+    :raises ValueError: for an unknown engine, an option that it does not have, or a value that cannot work
+    """
+
+    engine: str = "local"
+    jobs: int | None = None
+    address: str | None = None
+    cpus: int | None = None
+    gpus: float | None = None
+    memory: float | None = None
+    slurm: Mapping[str, Any] = field(default_factory=dict)
+    checkpoint_every: int = 1_000
+
+    def __post_init__(self) -> None:
+        check_name("--engine", self.engine, ENGINES)
+        for name, engines in OWN_OPTIONS.items():
+            if getattr(self, name) not in (None, {}) and self.engine not in engines:
+                raise ValueError(f"--{name} is an option of --engine {' and '.join(engines)}; this is --engine {self.engine}")
+        if self.engine == "slurm" and self.gpus is not None and self.gpus != round(self.gpus):
+            raise ValueError(f"--gpus {self.gpus}: Slurm gives whole GPUs")
+
+    @property
+    def measures(self) -> bool:
+        """Whether it depends on what runs need."""
+        return self.jobs is None if self.engine == "local" else self.memory is None
+
+
+def parse_assignments(assignments: Sequence[str], flag: str) -> dict[str, Any]:
+    """
+    :param assignments: ``name=value``; numbers become numbers
+    :param flag: where they come from
+    :raises ValueError: for anything else, or a name that comes twice
+    """
+    found: dict[str, Any] = {}
+    for one in assignments:
+        name, equals, value = one.partition("=")
+        if not equals or not name or not value:
+            raise ValueError(f"{flag} {one!r} must be NAME=VALUE")
+        if name in found:
+            raise ValueError(f"{flag} {one!r}: {name} is there twice")
+        found[name] = int(value) if value.isdigit() else value
+    return found
+
+
+def check_folder(root: Path) -> None:
+    """
+    :param root: where runs will be written; it need not exist
+    :raises ValueError: if nothing can be written there
+    """
+    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    try:
+        if not existing.is_dir():
+            raise NotADirectoryError(f"{existing} is a file")
+        with atomic_write(existing / ".sb3-crc-can-write") as unfinished:
+            unfinished.touch()
+        (existing / ".sb3-crc-can-write").unlink()
+    except OSError as error:
+        raise ValueError(f"nothing can be written to {root}: {error.strerror or error}") from None
+
+
+def describe(specs: Sequence[RunSpec], root: Path, how: Campaign) -> Iterator[str]:
+    """
+    :param specs: of a comparison
+    :param root: folder of its runs
+    :param how: it would be executed
+    :return: lines: what state each run is in and what it needs, and all that is to be done. Nothing is started but the
+        measurement of a few seconds of each kind of run
+    """
+    waiting = [spec for spec in specs if not finished(root / spec.name)]
+    jobs, threads, needs, reasons = _resources(waiting, how)
+    for spec in specs:
+        line = f"{root / spec.name}: {spec.agent_steps} agent steps, "
+        if spec not in waiting:
+            yield line + "finished"
+        elif spec.name in reasons:
+            yield line + f"to run, but it cannot begin: {reasons[spec.name]}"
+        else:
+            one = needs[spec.name]
+            gpu = f", {one.gpu_memory / GIGABYTE:.1f} GB on the GPU" if one.gpu_memory else ""
+            yield line + f"to run: {_duration(one.seconds)}, {_gigabytes(one.memory)} memory{gpu}, {_gigabytes(one.disk)} disk"
+    if needs:
+        known = list(needs.values())
+        at_once = sorted((one.memory for one in known), reverse=True)[:jobs]
+        where = f"{jobs} at once, threads each: {threads}" if how.engine == "local" else f"if {jobs} run at once"
+        yield (
+            f"{len(waiting)} of {len(specs)} runs to do, {where}: {_duration(seconds_for_all(known, jobs))} or more, "
+            f"{_gigabytes(sum(at_once))} memory, {_gigabytes(sum(one.disk for one in known))} disk"
+        )
+
+
+def execute(specs: Sequence[RunSpec], root: Path, how: Campaign) -> list[RunSpec]:
+    """
+    Work off a comparison; what is finished stays as it is.
+
+    :param specs: of it
+    :param root: folder of its runs
+    :param how: it is executed
+    :return: runs that failed
+    :raises ValueError: if the folder, its disk or the engine will not do
+    :raises Stopped: on SIGINT or SIGTERM
+    """
+    check_folder(root)
+    waiting = [spec for spec in specs if not finished(root / spec.name)]
+    jobs, _, needs, _ = _resources(waiting, how) if how.measures else (how.jobs or 1, 1, {}, {})
+    check_disk(list(needs.values()), root)
+    root.mkdir(parents=True, exist_ok=True)
+
+    def report(spec: RunSpec, event: str, remark: str) -> None:
+        done = sum(finished(root / one.name) for one in specs)
+        say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
+
+    with _shown(root, specs):
+        return _engine(how, jobs, needs)(specs, root, checkpoint_every=how.checkpoint_every, report=report)
+
+
+def _engine(how: Campaign, jobs: int, needs: Mapping[str, Needs]) -> Callable[..., list[RunSpec]]:
+    measured = max((one.memory for one in needs.values()), default=None)
+    memory = measured if how.memory is None else round(how.memory * GIGABYTE)
+    if how.engine == "ray":
+        from sb3_crc.experiments.engines.ray_cluster import RayOptions, run_on_ray
+
+        return partial(
+            run_on_ray, options=RayOptions(address=how.address, cpus=how.cpus or 1, gpus=how.gpus or 0.0, memory=memory)
+        )
+    if how.engine == "slurm":
+        from sb3_crc.experiments.engines.slurm import SlurmOptions, run_on_slurm
+
+        parameters = dict(how.slurm)
+        options = SlurmOptions(
+            cluster=str(parameters.pop("cluster", "slurm")),
+            minutes=int(parameters.pop("timeout_min", SlurmOptions.minutes)),
+            cpus=how.cpus or 1,
+            gpus=round(how.gpus or 0),
+            memory=memory,
+            at_once=how.jobs,
+            parameters=parameters,
+        )
+        return partial(run_on_slurm, options=options)
+    return partial(run_locally, jobs=jobs)
+
+
+def _resources(waiting: Sequence[RunSpec], how: Campaign) -> tuple[int, int, dict[str, Needs], dict[str, str]]:
+    """:return: runs at once, threads of each, their needs, and why some cannot begin"""
+    if not waiting:
+        return how.jobs or 1, 1, {}, {}
+    likely = how.jobs or min(len(waiting), usable_cores())
+    threads = threads_each(likely) if how.engine == "local" else how.cpus or 1
+    say(f"measuring what runs need: a few seconds of each kind, with {threads} threads", errors)
+    needs, reasons = measure_needs(waiting, threads)
+    jobs = how.jobs or min(len(waiting), most_at_once(list(needs.values())))
+    return jobs, threads_each(jobs) if how.engine == "local" else threads, needs, reasons
+
+
+@contextmanager
+def _shown(root: Path, specs: Sequence[RunSpec]) -> Iterator[None]:
+    """Within it a table of all runs, and of all together, stands in a terminal below what is said."""
+    if not console.is_terminal:
+        yield
+        return
+    from rich.live import Live
+
+    names = {spec.name for spec in specs}
+    last: list[Progress] = []
+
+    def look() -> Any:
+        try:
+            runs = [run for run in find_runs([root]) if run.spec_folder is not None]
+            last[:] = [read_progress(run) for run in runs if str(run.spec_folder.relative_to(root)) in names]  # type: ignore[union-attr]
+        except (ValueError, FileNotFoundError):  # a file is just being written
+            pass
+        return progress_table(last)
+
+    with Live(get_renderable=look, console=console, refresh_per_second=0.5):
+        yield
+
+
+def _duration(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))
+
+
+def _gigabytes(number: int) -> str:
+    return f"{number / GIGABYTE:.1f} GB"
