@@ -26,7 +26,8 @@ test: rendering ## the fast tests, a few minutes on two cores
 	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)
 
 test-slow: rendering ## the slow tests: real environments, real training runs
-	@.venv/bin/python -m pytest -m slow $(ARGS) || [ $$? -eq 5 ] # 5: there are none
+	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 --dist worksteal -m "slow and not alone" $(ARGS) || [ $$? -eq 5 ] # 5: none
+	@.venv/bin/python -m pytest -m "slow and alone" $(ARGS) || [ $$? -eq 5 ]
 
 test-long: rendering ## the tests that take hours
 	@.venv/bin/python -m pytest -m long $(ARGS) || [ $$? -eq 5 ]

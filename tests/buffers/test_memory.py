@@ -91,6 +91,7 @@ print(json.dumps(result))
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_100_000_transitions_of_three_frames_fit_in_3_2_gb(capsys: pytest.CaptureFixture[str]) -> None:
     """SB3's buffer takes 18.0. In a process of its own, whose memory nothing else has touched."""
     assert psutil.virtual_memory().available > 5e9, "this test needs 5 GB of free memory"

@@ -50,6 +50,7 @@ def in_turn(ours: Callable[[], object], raw: Callable[[], object], rounds: int) 
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("observation", ["state", "pixels", "dict"])
 @pytest.mark.parametrize("task", ["cartpole-swingup", "cheetah-run", "quadruped-walk"])
 def test_overhead_per_decision(task: str, observation: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,6 +89,7 @@ def test_overhead_per_decision(task: str, observation: str, monkeypatch: pytest.
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("render_quality", ["benchmark", "fast"])
 @pytest.mark.parametrize("task", ["cartpole-swingup", "cheetah-run", "quadruped-walk"])
 def test_pixels_run_at_the_speed_of_the_simulator(task: str, render_quality: str) -> None:

@@ -167,7 +167,6 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("shared", [None, False], ids=["shared folder", "object store"])
 def test_a_node_that_dies_loses_nothing(
     tmp_path: Path, cluster: Any, uninterrupted: dict[str, Any], shared: bool | None
@@ -197,7 +196,6 @@ def test_a_node_that_dies_loses_nothing(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_failures_on_ray_do_not_stop_the_others(tmp_path: Path) -> None:
     broken = compared(["crc"], ["cartpole-swingup"], [1], env_steps=1200, eval_every=400, eval_episodes=1, conf_file=TINY)[0]
     broken = RunSpec(**{**asdict(broken), "settings": {**broken.settings, "augmentation": "mirror"}})
@@ -208,7 +206,6 @@ def test_failures_on_ray_do_not_stop_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_job_that_is_preempted_goes_on(tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
     (spec, other) = specs("crc", "rad")
     stopped = threading.Event()
@@ -236,7 +233,6 @@ def test_a_job_that_is_preempted_goes_on(tmp_path: Path, uninterrupted: dict[str
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_job_that_is_killed_is_submitted_again(tmp_path: Path, uninterrupted: dict[str, Any]) -> None:
     (spec,) = specs("rad")
     stopped = threading.Event()

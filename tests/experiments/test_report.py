@@ -194,6 +194,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_thirty_runs_in_a_browser(tmp_path: Path, browser: Any) -> None:
     runs = tmp_path / "runs"
     for seed in range(10):
