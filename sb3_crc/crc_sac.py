@@ -258,11 +258,6 @@ class CRCSAC(BaseCRCSAC):
                 f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
             )
 
-    def _stop_if_not_finite(self, history: LossHistory, batch_size: int) -> None:
-        assert self.replay_buffer is not None
-        normalize, folder = self._vec_normalize_env, self.logger.dir
-        history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
-
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
         buffer, normalize = self.replay_buffer, self._vec_normalize_env
@@ -390,7 +385,9 @@ class CRCSAC(BaseCRCSAC):
         """Log the means over one call of :meth:`train`."""
         means = history.means()
         if not np.isfinite(list(means.values())).all():
-            self._stop_if_not_finite(history, batch_size)
+            assert self.replay_buffer is not None
+            normalize, folder = self._vec_normalize_env, self.logger.dir
+            history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
         for name, mean in means.items():
             self.logger.record(name, mean)
         if "representation/latent_std" in means:

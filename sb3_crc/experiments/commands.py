@@ -119,7 +119,7 @@ def table(
     allow_mixed: Mixed = False,
 ) -> None:
     """The paper's table: published scores, ours beside them, and what is missing."""
-    from sb3_crc.experiments.tables import table_text
+    from sb3_crc.experiments.table_formats import table_text
 
     text = table_text(which, sources, format, allow_mixed)
     if output is None:

@@ -1,19 +1,17 @@
 """Figures and summaries of a comparison: what ``sb3-crc curves`` writes."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sb3_crc.experiments.scores import PROTOCOL, Scores, final_means, one_protocol
+from sb3_crc.experiments.comparison_summary import about, count, listed, machines, markdown, summary, write_rows
+from sb3_crc.experiments.scores import Scores, final_means, one_protocol
 from sb3_crc.experiments.statistics import (
     HIGHEST_RETURN,
     NOT_RESOLVED,
-    ONE_SEED,
     REPS,
-    STATISTICS,
     Curve,
     Difference,
     Estimate,
@@ -30,11 +28,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FIGURES = ("sample_efficiency.png", "wall_time.png", "improvement.png", "profile.png", "tasks.png")
-SUMMARY_COLUMNS = ("method", "baseline", "statistic", "value", "low", "high", "seeds", "tasks", "verdict")
 DOTS_PER_INCH = 150
 STEPS, HOURS, RETURN = "environment steps", "hours of training, without evaluations", "return"
-#: Below this many seeds the summary says what an interval of a bootstrap is worth
-FEW_SEEDS = 8
 
 #: task -> name of a policy to compare with -> its return
 References = Mapping[str, Mapping[str, float]]
@@ -84,7 +79,7 @@ def draw_comparison(
     figures: dict[str, Any] = {}
     steps, seconds = curve(scores.table, "environment_steps", reps=reps), curve(scores.table, "seconds", reps=reps)
     notes["Not in the curves"] = list(steps.left_out)
-    notes["About wall time"] = [*(one for one in seconds.left_out if one not in steps.left_out), *_machines(current)]
+    notes["About wall time"] = [*(one for one in seconds.left_out if one not in steps.left_out), *machines(current)]
     if steps.methods:
         figures["sample_efficiency.png"] = _curves_figure(steps.methods, styles, STEPS)
         figures["tasks.png"] = _tasks_figure(scores.table, styles, references or {})
@@ -102,9 +97,9 @@ def draw_comparison(
         figure.savefig(folder / name, dpi=DOTS_PER_INCH)
 
     aggregates = aggregate(matrices.scores, reps=reps)
-    text = _summary(matrices, aggregates, compared, baseline, final, notes)
+    text = summary(matrices, aggregates, compared, baseline, final, notes)
     (folder / "summary.md").write_text(text, encoding="utf-8")
-    _write_rows(folder / "summary.csv", matrices, aggregates, compared)
+    write_rows(folder / "summary.csv", matrices, aggregates, compared)
     return [folder / name for name in (*figures, "summary.md", "summary.csv")]
 
 
@@ -137,12 +132,12 @@ def draw_weights(
     figure = _weights_figure({method: (weights[method], mean.value) for method, mean in means.items()}, matrices)
     figure.savefig(picture, dpi=DOTS_PER_INCH)
     rows = [(method, *(f"{share:.3g}" for share in weights[method]), mean.text()) for method, mean in means.items()]
-    lines = ["# Convex weights", "", _of(matrices), ""]
-    lines += _markdown(("method", "contrastive", "reconstruction", "consistency", "mean final return"), rows)
+    lines = ["# Convex weights", "", about(matrices), ""]
+    lines += markdown(("method", "contrastive", "reconstruction", "consistency", "mean final return"), rows)
     lines.append("")
     absent = [f"{method}: no final score" for method in weights if method not in means]
     missing = [str(one) for one in scores.missing if one.method in weights]
-    lines += _listed("Left out", [*absent, *matrices.dropped, *missing])
+    lines += listed("Left out", [*absent, *matrices.dropped, *missing])
     text.write_text("\n".join(lines), encoding="utf-8")
     return [picture, text]
 
@@ -151,10 +146,6 @@ def _style(number: int) -> dict[str, Any]:
     """A colour, and for those who cannot tell colours apart a marker; beyond ten methods another kind of line."""
     lines: tuple[Literal["-", "--", ":", "-."], ...] = ("-", "--", ":", "-.")
     return {"color": f"C{number % 10}", "marker": "osD^vPX*<>"[number % 10], "linestyle": lines[number // 10 % len(lines)]}
-
-
-def _count(number: int, name: str) -> str:
-    return f"{number} {name}{'s' * (number != 1)}"
 
 
 def _new_figure(height: float, labels: Sequence[str] = ()) -> Any:
@@ -195,9 +186,9 @@ def _draw_all(
 
 
 def _curves_figure(curves: Mapping[str, Curve], styles: Mapping[str, Mapping[str, Any]], abscissa: str) -> Any:
-    labels = {method: f"{method}, {_count(shown.seeds, 'seed')}" for method, shown in curves.items()}
+    labels = {method: f"{method}, {count(shown.seeds, 'seed')}" for method, shown in curves.items()}
     figure, axes = _draw_all(curves, styles, labels, scale=1 / 3600 if abscissa == HOURS else 1.0)
-    tasks = _count(next(iter(curves.values())).tasks, "task")
+    tasks = count(next(iter(curves.values())).tasks, "task")
     banded = any(shown.interval is not None for shown in curves.values())
     axes.set_title(f"IQM over seeds, {tasks}{', with 95 % intervals' * banded}", fontsize=11)
     axes.set_xlabel(f"{abscissa} (each until its first run ends)" if abscissa == HOURS else abscissa)
@@ -282,7 +273,7 @@ def _improvement_figure(compared: Sequence[Difference], styles: Mapping[str, Map
     for axes in (left, right):
         axes.grid(alpha=0.3, axis="x")
     intervals = "95 % intervals; hollow: not resolved" if seeds > 1 else "no interval"
-    figure.suptitle(f"Final policies against {baseline}, {_count(seeds, 'seed')}, {intervals}", fontsize=11)
+    figure.suptitle(f"Final policies against {baseline}, {count(seeds, 'seed')}, {intervals}", fontsize=11)
     return figure
 
 
@@ -305,11 +296,11 @@ def _point(axes: Any, estimate: Estimate, row: int, style: Mapping[str, Any], fi
 
 
 def _profile_figure(profiles: Mapping[str, Curve], styles: Mapping[str, Mapping[str, Any]]) -> Any:
-    labels = {method: f"{method}, {_count(shown.seeds * shown.tasks, 'run')}" for method, shown in profiles.items()}
+    labels = {method: f"{method}, {count(shown.seeds * shown.tasks, 'run')}" for method, shown in profiles.items()}
     figure, axes = _draw_all(profiles, styles, labels)
     one = next(iter(profiles.values()))
     banded = ", with 95 % intervals" if one.interval is not None else ""
-    axes.set_title(f"Performance profile: {_count(one.seeds, 'seed')}, {_count(one.tasks, 'task')}{banded}", fontsize=11)
+    axes.set_title(f"Performance profile: {count(one.seeds, 'seed')}, {count(one.tasks, 'task')}{banded}", fontsize=11)
     axes.set_xlabel("final return x")
     axes.set_ylabel("share of runs with a return above x")
     axes.set_xlim(0, HIGHEST_RETURN)
@@ -342,16 +333,8 @@ def _weights_figure(points: Mapping[str, tuple[Weights, float]], matrices: Score
     axes.set_xlim(-0.12, 1.16)
     axes.set_ylim(-0.12, 1.0)
     figure.colorbar(drawn, ax=axes, label="mean final return", shrink=0.75)
-    figure.supxlabel(_of(matrices, names=len(matrices.tasks) < 3), fontsize=9)
+    figure.supxlabel(about(matrices, names=len(matrices.tasks) < 3), fontsize=9)
     return figure
-
-
-def _machines(current: "pd.DataFrame") -> list[str]:
-    known = current.dropna(subset=["seconds"])
-    machines = known.groupby("machine", dropna=False)["method"].unique()
-    if len(machines) < 2:
-        return []
-    return [f"runs on different machines: {name}: {', '.join(methods)}" for name, methods in machines.items()]
 
 
 def _why_not(name: str, scored: int) -> str:
@@ -362,72 +345,3 @@ def _why_not(name: str, scored: int) -> str:
     if name in {"improvement.png", "profile.png"}:
         return "no task and seed has a final score of every method"
     return "no run has evaluations during training that can be shown"
-
-
-def _of(matrices: ScoreMatrices, names: bool = True) -> str:
-    if not matrices.scores:
-        return "No final scores to compare."
-    tasks = ", ".join(matrices.tasks) if names else _count(len(matrices.tasks), "task")
-    return f"{tasks}; {'seeds' if len(matrices.seeds) > 1 else 'seed'} {', '.join(map(str, matrices.seeds))}"
-
-
-def _summary(
-    matrices: ScoreMatrices,
-    aggregates: Mapping[str, Mapping[str, Estimate]],
-    compared: Sequence[Difference],
-    baseline: str,
-    final: "pd.DataFrame",
-    notes: Mapping[str, Sequence[str]],
-) -> str:
-    lines = ["# Comparison", "", _of(matrices), ""]
-    if matrices.scores:
-        protocol = [f"{column} {', '.join(map(str, final[column].dropna().unique()))}" for column in PROTOCOL]
-        lines += [f"Final policies: {'; '.join(protocol)}.", "", "## Final returns", ""]
-        rows = [(method, *(found[name].text() for name in STATISTICS)) for method, found in aggregates.items()]
-        lines += [*_markdown(("method", *STATISTICS), rows), ""]
-    if compared:
-        lines += [f"## Against {baseline}", ""]
-        header = ("method", "difference of IQMs", "verdict", f"P(method > {baseline})")
-        cells = [(one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")) for one in compared]
-        lines += _markdown(header, cells)
-        lines += ["", f"'{NOT_RESOLVED}': the interval of the difference includes 0, or there is none.", ""]
-    if len(matrices.seeds) > 1:
-        lines += ["In parentheses: 95 % intervals, stratified bootstrap over seeds; differences paired by seed.", ""]
-    elif matrices.seeds:
-        lines += [f"{ONE_SEED.capitalize()}.", ""]
-    if 1 < len(matrices.seeds) < FEW_SEEDS:
-        lines += [
-            f"With {len(matrices.seeds)} seeds these intervals are too narrow: on one task, two equal methods come out as "
-            "different in about 50 % of comparisons with 2 seeds, 26 % with 3, 10 % with 5 and 7 % with 10, instead of 5 %.",
-            "",
-        ]
-    for title, entries in notes.items():
-        lines += _listed(title, entries)
-    return "\n".join(lines)
-
-
-def _listed(title: str, entries: Sequence[str]) -> list[str]:
-    return [f"## {title}", "", *(f"- {entry}" for entry in entries), ""] if entries else []
-
-
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
-
-
-def _write_rows(
-    path: Path,
-    matrices: ScoreMatrices,
-    aggregates: Mapping[str, Mapping[str, Estimate]],
-    compared: Sequence[Difference],
-) -> None:
-    found = [(method, "", name, one, "") for method, own in aggregates.items() for name, one in own.items()]
-    for one in compared:
-        found.append((one.method, one.baseline, "difference of IQM", one.iqm, one.verdict))
-        found.append((one.method, one.baseline, "probability of improvement", one.probability, ""))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(SUMMARY_COLUMNS)
-        for method, baseline, name, estimate, verdict in found:
-            low, high = ("", "") if estimate.interval is None else estimate.interval
-            counts = len(matrices.seeds), len(matrices.tasks)
-            writer.writerow([method, baseline, name, estimate.value, low, high, *counts, verdict])

@@ -13,7 +13,8 @@ from scipy.stats import trim_mean
 
 from sb3_crc.experiments.published import SIX_TASKS
 from sb3_crc.experiments.scores import COLUMNS, Missing, MixedProtocols, Scores, write_scores
-from sb3_crc.experiments.tables import CSV_COLUMNS, FORMATS, MISSING, SIX_TASK_MEAN, paper_table, render, table_text
+from sb3_crc.experiments.table_formats import CSV_COLUMNS, FORMATS, MISSING, render, table_text
+from sb3_crc.experiments.tables import SIX_TASK_MEAN, paper_table
 
 CARTPOLE, QUADRUPED = "cartpole-swingup", "quadruped-walk"
 

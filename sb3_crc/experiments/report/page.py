@@ -25,7 +25,8 @@ from sb3_crc.experiments.report.contents import (
 )
 from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, read_scores
 from sb3_crc.experiments.statistics import Axis, curve, training_runs
-from sb3_crc.experiments.tables import Grid, allowed_budgets, check_whole, grids, paper_table, same_steps
+from sb3_crc.experiments.table_formats import Grid, grids
+from sb3_crc.experiments.tables import allowed_budgets, check_whole, paper_table, same_steps
 
 if TYPE_CHECKING:
     import pandas as pd
