@@ -11,7 +11,7 @@ TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 STAMP := .venv/.installed-$(shell cat pyproject.toml constraints.txt | cksum | tr ' ' '-')
 
-.PHONY: help train test test-slow test-long bench lint constraints doctor clean install rendering
+.PHONY: help train test test-slow test-long reproduce-quick results bench lint constraints doctor clean install rendering
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
@@ -31,6 +31,15 @@ test-slow: rendering ## the slow tests: real environments, real training runs
 
 test-long: rendering ## the tests that take hours
 	@.venv/bin/python -m pytest -m long $(ARGS) || [ $$? -eq 5 ]
+
+reproduce-quick: rendering ## one row of docs/results.md anew, about an hour on two idle cores, and compare
+	@.venv/bin/python -m sb3_crc compare --task cartpole-swingup --presets crc --seeds 1 --first-seed 21 --eval-every 20000 \
+	  --conf-file zoo_configs/laptop.yml -o reproduction --jobs 1 $(ARGS)
+	@.venv/bin/python -m sb3_crc reproduced reproduction results/laptop/final
+
+results: $(STAMP) ## docs/results.md from the raw files in results/
+	@.venv/bin/python -m sb3_crc results results/laptop/final --baseline crc --landmarks results/landmarks.json \
+	  --trials results/laptop/trials.csv -o docs/results.md
 
 bench: rendering ## speed and memory beside peers, two hours on two idle cores; one alone: make bench ARGS=update
 	@.venv/bin/python -m benchmarks $(or $(ARGS),all)

@@ -174,6 +174,64 @@ def report(
 
 @app.command()
 @in_one_line
+def results(
+    sources: Sources,
+    output: Annotated[Path, typer.Option("--output", "-o", help="file to write")] = Path("results.md"),
+    baseline: Annotated[str, typer.Option(help="the method that others are compared with")] = "rad",
+    landmarks_file: Annotated[Path | None, typer.Option("--landmarks", help="of `sb3-crc landmarks`")] = None,
+    trials: Annotated[Path | None, typer.Option(help="table of trials, of `sb3-crc trials`")] = None,
+) -> None:
+    """What scores show and what they do not, as a page: each seed, chances to reach what is published, what was not done."""
+    from sb3_crc.experiments.evidence import results_page
+
+    output.write_text(results_page(sources, baseline=baseline, landmarks=landmarks_file, trials=trials), encoding="utf-8")
+    say(str(output))
+
+
+@app.command()
+@in_one_line
+def landmarks(
+    task: Annotated[list[str] | None, typer.Option(help="domain-task; once for each; else the paper's ten")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="of each policy on each task")] = 10,
+    output: Annotated[Path, typer.Option("--output", "-o", help="JSON file to write")] = Path("landmarks.json"),
+) -> None:
+    """Measure what random actions and no actions get."""
+    from sb3_crc.envs.tasks import PAPER_TASKS
+    from sb3_crc.experiments.landmarks import measure_landmarks
+    from sb3_crc.experiments.runs import write_json
+
+    found = measure_landmarks(task or PAPER_TASKS, episodes=episodes)
+    write_json(found, output)
+    for name, policies in found["returns"].items():
+        say(f"{name}: {', '.join(f'{policy} {sum(own) / len(own):.1f}' for policy, own in policies.items())}")
+
+
+@app.command()
+@in_one_line
+def reproduced(
+    runs: Annotated[Path, typer.Argument(help="folder with runs of one method on one task, or CSV file of their scores")],
+    committed: Annotated[Path, typer.Argument(help="scores that are to be reproduced: CSV file, or folder of runs")],
+) -> None:
+    """Do runs agree with scores that are committed? The exit code is 1 if they do not."""
+    from sb3_crc.experiments.evidence import compare_with
+
+    found = compare_with(committed, runs)
+    for name in ("committed", "reproduced"):
+        each = ", ".join(f"seed {seed}: {value:.1f}" for seed, value in found[name].items())
+        say(f"{found['method']} on {found['task']}, {name}: {sum(found[name].values()) / len(found[name]):.1f} ({each})")
+    if found["interval"] is None:
+        say("one committed seed: no interval to compare with")
+        return
+    low, high = found["interval"]
+    mean = sum(found["reproduced"].values()) / len(found["reproduced"])
+    say(f"expected if nothing has changed: {low:.0f} to {high:.0f} (95 %)")
+    if not low <= mean <= high:
+        say("outside of it", errors)
+        raise typer.Exit(1)
+
+
+@app.command()
+@in_one_line
 def watch(
     runs: Annotated[list[Path], typer.Argument(help="runs of train.py, or folders that contain some")],
     every: Annotated[float, typer.Option(min=0.5, help="seconds between two looks")] = 5.0,

@@ -1,0 +1,190 @@
+"""What scores show, and what they do not: one page, made from raw files alone. What ``sb3-crc results`` writes."""
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_crc.experiments.comparison_summary import markdown
+from sb3_crc.experiments.published import SIX_TASKS, read_published
+from sb3_crc.experiments.runs import read_json
+from sb3_crc.experiments.scores import final_means, one_protocol, read_scores
+from sb3_crc.experiments.statistics import HIGHEST_RETURN, NOT_RESOLVED, aggregate, differences, score_matrices
+from sb3_crc.experiments.tables import check_whole
+from sb3_crc.presets import PRESETS
+from sb3_crc.settings import check_name
+from sb3_crc.stock import STOCK
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: The paper's row, and for each task the highest published mean of an agent without a language model, at 100 000 steps
+PAPER = "CRC-RL"
+BEST: dict[str, str] = {
+    "cartpole-swingup": "Simoun",
+    "ball_in_cup-catch": "Simoun",
+    "finger-spin": "TD-MPC2",
+    "reacher-easy": "ResAct (as in COVR)",
+    "cheetah-run": "Simoun",
+    "walker-walk": "Simoun",
+}
+BUDGET = 100_000
+#: Seeds from which a bootstrap says something about a mean, and its samples
+ENOUGH_SEEDS, SAMPLES = 3, 10_000
+
+
+def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | None = None, trials: Path | None = None) -> str:
+    """
+    :param sources: CSV files of scores, or folders that contain runs
+    :param baseline: method with which the others are compared
+    :param landmarks: file of ``sb3-crc landmarks``
+    :param trials: table of the trials that led to the settings
+    :return: Markdown. The same files give the same page
+    :raises FileNotFoundError: if a file does not exist
+    :raises ValueError: if there are no final scores, or they do not belong together
+    """
+    scores = read_scores(sources)
+    final = scores.final
+    if final.empty:
+        raise ValueError(f"there is no score of a final policy in {', '.join(map(str, sources))}")
+    check_whole(final)
+    means = final_means(one_protocol(final))
+    check_name("baseline", baseline, list(dict.fromkeys(means["method"])))
+    lines = ["# Results", ""]
+    lines += _paragraph(
+        "Made by `sb3-crc results` from raw files alone; do not edit. Every figure is the return of the FINAL policy after "
+        "exactly the budget, random first steps and repeated actions included: mean action, fresh episodes, whose seeds are "
+        "the same for all methods and were used by no training and no other evaluation. All runs are shown."
+    )
+    measured = {} if landmarks is None else read_json(landmarks)["returns"]
+    for task in dict.fromkeys(means["task"]):
+        lines += _task(task, means[means["task"] == task], measured.get(task, {}))
+    lines += _compared(means, baseline)
+    lines += _conditions(final)
+    if trials is not None:
+        lines += _trials(trials)
+    absent = [f"- {missing}" for missing in scores.missing]
+    absent += [f"- no run on {task}" for task in SIX_TASKS if task not in set(means["task"])]
+    absent += [f"- no run of {name}" for name in (*PRESETS, *STOCK) if name not in set(means["method"])]
+    if absent:
+        lines += ["## Not done", "", *absent, ""]
+    return "\n".join(lines)
+
+
+def probability_of_reaching(returns: Sequence[float], goal: float, *, seed: int = 0) -> float | None:
+    """
+    :param returns: one of each training seed
+    :param goal: return
+    :param seed: of the bootstrap
+    :return: share of bootstrap samples of the seeds whose mean reaches it; None with too few seeds
+    """
+    if len(returns) < ENOUGH_SEEDS:
+        return None
+    drawn = np.random.default_rng(seed).choice(np.asarray(returns, float), (SAMPLES, len(returns)))
+    return float((drawn.mean(axis=1) >= goal).mean())
+
+
+def goals(task: str) -> dict[str, float]:
+    """:param task: domain-task; :return: what is published for it at 100 000 environment steps: who -> mean"""
+    cells = read_published()
+    cells = cells[(cells["task"] == task) & (cells["environment_steps"] == BUDGET)].set_index("method")["mean"]
+    return {name: float(cells[name]) for name in (PAPER, BEST.get(task, PAPER)) if name in cells}
+
+
+def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[float]]) -> Iterator[str]:
+    wanted = goals(task)
+    header = ["method", "seeds: return of each", "mean", "IQM", *(f"P(mean >= {value:.0f})" for value in wanted.values())]
+    rows = []
+    for method, own in means.groupby("method", sort=False):
+        returns = [float(value) for value in own.sort_values("seed")["return"]]
+        (statistics,) = aggregate({"": np.array(returns)[:, None] / HIGHEST_RETURN}).values()
+        each = ", ".join(f"{seed}: {value:.0f}" for seed, value in sorted(zip(own["seed"], own["return"], strict=True)))
+        chances = [probability_of_reaching(returns, goal) for goal in wanted.values()]
+        shown = ["" if chance is None else f"{chance:.2f}" for chance in chances]
+        rows.append([str(method), each, statistics["mean"].text(), statistics["IQM"].text(), *shown])
+    for name, measured in landmarks.items():
+        rows.append([f"*{name} actions*", "", f"{np.mean(measured):.0f}", "", *("" for _ in wanted)])
+    yield from [f"## {task}", "", *markdown(header, rows), ""]
+    if wanted:
+        cited = "; ".join(f"{value:.0f}: {name}" for name, value in wanted.items())
+        yield from _paragraph(
+            f"Published at {BUDGET:,} environment steps: {cited}. {PAPER}'s ± is over evaluation runs of an unstated number "
+            "of trainings, and whether its steps are environment steps is not certain. In parentheses: 95 % intervals, "
+            f"bootstrap over seeds, which with few seeds are too narrow. P: share of {SAMPLES:,} bootstrap samples of the "
+            f"seeds, from {ENOUGH_SEEDS} seeds on."
+        )
+
+
+def _compared(means: "pd.DataFrame", baseline: str) -> Iterator[str]:
+    matrices = score_matrices(means)
+    if len(matrices.scores) < 2:
+        return
+    rows = [
+        [one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")]
+        for one in differences(matrices.scores, baseline)
+    ]
+    about = f"{', '.join(matrices.tasks)}; seeds {', '.join(map(str, matrices.seeds))}, those that every method has."
+    yield from [f"## Against {baseline}", "", about, ""]
+    yield from markdown(["method", "difference of IQMs", "verdict", f"P(method > {baseline})"], rows)
+    yield from ["", f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0.", ""]
+
+
+def _conditions(final: "pd.DataFrame") -> Iterator[str]:
+    yield from ["## Conditions", ""]
+    for task, rows in final.groupby("task", sort=False):
+        about = [f"{rows['action_repeat'].iloc[0]} environment steps per action", f"{rows['render_quality'].iloc[0]} pictures"]
+        about += [f"{rows['episodes'].iloc[0]} episodes", f"from seed {rows['first_seed'].iloc[0]}"]
+        yield f"- {task}: {', '.join(about)}"
+    for column, title in (("machine", "machines"), ("versions", "versions"), ("git_revision", "revisions")):
+        yield f"- {title}: {'; '.join(sorted(map(str, final[column].dropna().unique()))) or 'not recorded'}"
+    yield ""
+
+
+def _trials(path: Path) -> Iterator[str]:
+    import pandas as pd
+
+    counts = pd.read_csv(path)["algo"].value_counts(sort=False)
+    yield from ["## Trials before", ""]
+    yield from _paragraph(
+        f"The settings were found by trials on cartpole-swingup ({path.name}): "
+        f"{', '.join(f'{number} of {name}' for name, number in counts.items())}; none of any other method, which have the "
+        "settings that `rad` was tuned for."
+    )
+
+
+def _paragraph(text: str) -> list[str]:
+    return [*textwrap.wrap(text, 127, break_long_words=False, break_on_hyphens=False), ""]
+
+
+def compare_with(committed: Path, reproduced: Path) -> dict[str, Any]:
+    """
+    :param committed: CSV file of scores, or folder of runs
+    :param reproduced: the same, of one method on one task
+    :return: ``method``, ``task``, ``committed`` and ``reproduced`` returns by seed, and the 95 % ``interval`` in which the
+        mean of the reproduced seeds is to be expected if nothing has changed (Student's t); None with one committed seed
+    :raises ValueError: if one has no final score, or the other none of the same
+    """
+    from scipy.stats import t
+
+    found = final_means(read_scores([reproduced]).final)
+    if len(found[["method", "task"]].drop_duplicates()) != 1:
+        raise ValueError(f"{reproduced} must hold final scores of one method on one task")
+    method, task = found[["method", "task"]].iloc[0]
+    before = final_means(read_scores([committed]).final)
+    before = before[(before["method"] == method) & (before["task"] == task)]
+    if before.empty:
+        raise ValueError(f"{committed} has no final score of {method} on {task}")
+    old, new = before["return"].to_numpy(float), found["return"].to_numpy(float)
+    interval = None
+    if len(old) > 1:
+        half = t.ppf(0.975, len(old) - 1) * old.std(ddof=1) * np.sqrt(1 / len(old) + 1 / len(new))
+        interval = float(old.mean() - half), float(old.mean() + half)
+    return {
+        "method": str(method),
+        "task": str(task),
+        "committed": {int(seed): float(value) for seed, value in zip(before["seed"], old, strict=True)},
+        "reproduced": {int(seed): float(value) for seed, value in zip(found["seed"], new, strict=True)},
+        "interval": interval,
+    }

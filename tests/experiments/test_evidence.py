@@ -1,0 +1,107 @@
+"""The page of results follows from the raw files, and says what they do not show."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from sb3_crc.cli import app
+from sb3_crc.experiments.evidence import BEST, compare_with, goals, probability_of_reaching, results_page
+from sb3_crc.experiments.landmarks import measure_landmarks
+from sb3_crc.experiments.published import SIX_TASKS
+from sb3_crc.experiments.scores import COLUMNS
+
+ROOT = Path(__file__).parents[2]
+
+
+def scores(path: Path, method: str, returns: dict[int, float], task: str = "cartpole-swingup") -> Path:
+    """Final scores, two episodes of each seed, a return above and below the mean."""
+    rows = []
+    for seed, mean in returns.items():
+        for episode, value in enumerate((mean - 10, mean + 10)):
+            row = dict.fromkeys(COLUMNS) | {"method": method, "preset": method, "task": task, "seed": seed, "policy": "final"}
+            row |= {
+                "budget": 100_000,
+                "environment_steps": 100_000,
+                "agent_steps": 12_500,
+                "episode": episode,
+                "return": value,
+            }
+            row |= {"first_seed": 10_000, "episodes": 2, "action_repeat": 8, "render_quality": "benchmark"}
+            rows.append(row | {"run": f"{method}/{task}/{seed}", "machine": "a machine", "git_revision": "abc"})
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+def test_the_committed_page_is_what_the_raw_files_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    results = Path("results")
+    page = results_page(
+        [results / "laptop" / "final"],
+        baseline="crc",
+        landmarks=results / "landmarks.json",
+        trials=results / "laptop" / "trials.csv",
+    )
+    assert page == (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), "run `make results`"
+
+
+def test_every_seed_is_shown_and_what_was_not_done(tmp_path: Path) -> None:
+    files = [scores(tmp_path / "a.csv", "crc", {0: 800, 1: 860, 2: 900}), scores(tmp_path / "b.csv", "rad", {0: 700, 1: 860})]
+    page = results_page(files, baseline="rad")
+    assert "| crc | 0: 800, 1: 860, 2: 900 | 853 (" in page and "| rad | 0: 700, 1: 860 | 780 (" in page
+    assert (
+        "rad on cartpole-swingup, seed 2: absent" in page and "- no run on walker-walk" in page and "- no run of drq" in page
+    )
+    assert "seeds 0, 1, those that every method has" in page
+    rad = next(line for line in page.splitlines() if line.startswith("| rad"))
+    assert rad.endswith("|  |  |")  # two seeds: no chances
+    assert "| 813 |" not in page and "P(mean >= 813)" in page and "P(mean >= 851)" in page
+
+
+def test_pages_of_nothing_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no score of a final policy"):
+        results_page([tmp_path], baseline="rad")
+    path = scores(tmp_path / "a.csv", "crc", {0: 800})
+    done = CliRunner().invoke(app, ["results", str(path), "--baseline", "red", "-o", str(tmp_path / "page.md")])
+    assert done.exit_code == 2 and "unknown baseline 'red'" in done.stderr and not (tmp_path / "page.md").exists()
+
+
+def test_chances_to_reach_a_goal() -> None:
+    assert probability_of_reaching([800, 900, 850], 700) == 1
+    assert probability_of_reaching([800, 900, 850], 901) == 0
+    assert probability_of_reaching([800, 900], 700) is None
+    # of three draws of 0 or 1 with equal chances of 1/3 and 2/3, the mean is 1 in 8 of 27
+    assert probability_of_reaching([0, 1, 1], 1) == pytest.approx(8 / 27, abs=0.02)
+
+
+def test_goals_are_published_figures() -> None:
+    found = {task: list(goals(task).values()) for task in SIX_TASKS}
+    assert [round(values[0]) for values in found.values()] == [813, 636, 355, 832, 793, 490]
+    assert [round(values[1]) for values in found.values()] == [851, 917, 518, 971, 981, 869]
+    assert set(BEST) == set(SIX_TASKS) and goals("humanoid-run") == {}
+
+
+def test_a_reproduction_is_compared_with_what_is_committed(tmp_path: Path) -> None:
+    committed = scores(tmp_path / "committed.csv", "crc", {1: 800, 2: 820, 3: 840})
+    found = compare_with(committed, scores(tmp_path / "new.csv", "crc", {1: 812}))
+    assert found["committed"] == {1: 800, 2: 820, 3: 840} and found["reproduced"] == {1: 812}
+    # the prediction interval of one more draw: mean +- t(0.975, 2) s sqrt(1 + 1/3)
+    assert np.allclose(found["interval"], (820 - 4.3027 * 20 * np.sqrt(4 / 3), 820 + 4.3027 * 20 * np.sqrt(4 / 3)), atol=0.01)
+
+    run = CliRunner().invoke(app, ["reproduced", str(tmp_path / "new.csv"), str(committed)])
+    assert run.exit_code == 0 and "expected if nothing has changed: 721 to 919" in run.stdout
+    scores(tmp_path / "new.csv", "crc", {1: 500})
+    run = CliRunner().invoke(app, ["reproduced", str(tmp_path / "new.csv"), str(committed)])
+    assert run.exit_code == 1 and "outside of it" in run.stderr
+    with pytest.raises(ValueError, match="has no final score of rad on cartpole-swingup"):
+        compare_with(committed, scores(tmp_path / "rad.csv", "rad", {1: 500}))
+
+
+def test_landmarks_are_repeatable_and_know_nothing() -> None:
+    found = measure_landmarks(["cartpole-swingup"], episodes=1)
+    again = measure_landmarks(["cartpole-swingup"], episodes=1)
+    assert found["returns"] == again["returns"]
+    assert 0 < found["returns"]["cartpole-swingup"]["random"][0] < 300
+    assert found["returns"]["cartpole-swingup"]["zero"][0] < 50  # it hangs down
