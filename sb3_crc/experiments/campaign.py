@@ -1,7 +1,7 @@
 """A comparison from its plan to its scores: what it needs, which engine executes it, how far it is."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
@@ -204,19 +204,22 @@ def _shown(root: Path, specs: Sequence[RunSpec]) -> Iterator[None]:
         return
     from rich.live import Live
 
-    names = {spec.name for spec in specs}
     last: list[Progress] = []
 
     def look() -> Any:
-        try:
-            runs = [run for run in find_runs([root]) if run.spec_folder is not None]
-            last[:] = [read_progress(run) for run in runs if str(run.spec_folder.relative_to(root)) in names]  # type: ignore[union-attr]
-        except (ValueError, FileNotFoundError):  # a file is just being written
-            pass
+        with suppress(ValueError, FileNotFoundError):  # a file is just being written
+            last[:] = [_progress(spec, root / spec.name) for spec in specs]
         return progress_table(last)
 
     with Live(get_renderable=look, console=console, refresh_per_second=0.5):
         yield
+
+
+def _progress(spec: RunSpec, folder: Path) -> Progress:
+    begun = next(find_runs([folder]), None) if folder.is_dir() else None
+    if begun is not None:
+        return read_progress(begun)
+    return Progress(f"{spec.method}, {spec.task}, seed {spec.seed}", "waiting", 0, spec.agent_steps, None, (), None, {})
 
 
 def _duration(seconds: float) -> str:

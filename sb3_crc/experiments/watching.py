@@ -36,7 +36,7 @@ BARS = "▁▂▃▄▅▆▇█"
 class Progress:
     """
     :param name: method, task and seed
-    :param status: of the run, or "silent" if an unfinished one has written nothing for a long time
+    :param status: of the run; "silent" if an unfinished one has written nothing for a long time; "waiting" if it is to come
     :param agent_steps: done, as far as the log says
     :param budget: agent steps that it was asked for
     :param seconds_left: at the present speed; None if that is not known
@@ -153,7 +153,10 @@ def _in_total(progresses: Sequence[Progress]) -> str:
     done = sum(min(one.agent_steps, one.budget) for one in progresses)
     budget = sum(one.budget for one in progresses)
     ended = sum(one.status in ("finished", "unevaluated") for one in progresses)
-    return f"{ended} of {len(progresses)} runs ended, {done / max(1, budget):.0%} of all decisions made"
+    text = f"{ended} of {len(progresses)} runs ended, {done / max(1, budget):.0%} of all decisions made"
+    speed = sum((one.budget - one.agent_steps) / one.seconds_left for one in progresses if one.seconds_left)
+    failed = any(one.status == "failed" for one in progresses)
+    return text if speed == 0 or failed else f"{text}, about {_duration((budget - done) / speed)} left"
 
 
 def _duration(seconds: float) -> str:

@@ -11,7 +11,9 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
+from sb3_crc.experiments import campaign
 from sb3_crc.experiments.runs import find_runs
+from sb3_crc.experiments.specs import compared
 from sb3_crc.experiments.watching import Progress, progress_table, read_progress, sparkline
 from tests.experiments.test_report import STEPS, make_run
 
@@ -93,3 +95,24 @@ def test_the_command_says_how_far_all_are(tmp_path: Path) -> None:
     assert result.exit_code == 0 and "1 of 2 runs ended" in result.output
     missing = CliRunner().invoke(app, ["watch", str(tmp_path / "nowhere")])
     assert missing.exit_code == 2 and "nowhere is no folder" in missing.output.replace("\n", "")
+
+
+def test_a_comparison_shows_what_is_still_to_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    specs = compared(["crc", "rad"], ["cartpole-swingup"], [0], env_steps=8 * STEPS, eval_every=400)
+    make_run(tmp_path / specs[0].name, "crc", ended=False)
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(campaign, "console", screen)
+    with campaign._shown(tmp_path, specs):
+        time.sleep(0.1)  # it is drawn on entering and on leaving
+    assert isinstance(screen.file, io.StringIO)
+    shown = screen.file.getvalue()
+    assert "0 of 2 runs ended" in shown and "waiting" in shown and "rad, cartpole-swingup" in shown
+
+
+def test_all_that_is_left_takes_as_long_as_those_that_run_need() -> None:
+    def progress(name: str, steps: int, left: float | None) -> Progress:
+        return Progress(name, "unfinished" if left else "waiting", steps, 1_000, left, (), None, {})
+
+    # two runs of 10 and 20 steps a second, and 500 + 500 + 1 000 steps to go
+    table = progress_table([progress("a", 500, 50.0), progress("b", 500, 25.0), progress("c", 0, None)])
+    assert table.title == "0 of 3 runs ended, 33% of all decisions made, about 0:01:07 left"
