@@ -16,6 +16,7 @@ from sb3_crc.encoder import PixelEncoder
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.envs.tasks import register_environments
 from sb3_crc.evaluation import QBiasEvalCallback
+from sb3_crc.export import export_policy, load_policy, load_weights
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
 
@@ -34,6 +35,9 @@ __all__ = [
     "QBiasEvalCallback",
     "ReconstructionImageCallback",
     "TrainingCheckpoint",
+    "export_policy",
+    "load_policy",
+    "load_weights",
     "make_dmc",
 ]
 

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sb3_crc.analysis.commands import app as analysis
-from sb3_crc.console import console, errors, say
+from sb3_crc.console import console, errors, in_one_line, say
 from sb3_crc.experiments.commands import app as experiments
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="CRC-RL for Stable-Baselines3.")
@@ -47,6 +47,57 @@ def doctor() -> None:
         say(f"{finding.name}: {finding.value}", errors)
     if broken:
         raise typer.Exit(1)
+
+
+@app.command()
+@in_one_line
+def export(
+    source: Annotated[Path, typer.Argument(help="run of train.py whose training has ended, or zip that CRCSAC has saved")],
+    output: Annotated[Path, typer.Argument(help="file to write, for instance policy.sb3crc")],
+) -> None:
+    """Write a policy as safetensors and JSON, which can be read without trust; the zip that it comes from cannot."""
+    from sb3_crc import CRCSAC
+    from sb3_crc.experiments.runs import Run
+    from sb3_crc.export import ENVIRONMENT_ARGUMENTS, export_policy
+
+    if source.is_dir():
+        run = Run(source)
+        if not run.model.exists():
+            raise FileNotFoundError(f"{source} has no final policy: its training has not ended")
+        env_kwargs = {name: value for name, value in run.env_kwargs.items() if name in ENVIRONMENT_ARGUMENTS}
+        written = export_policy(CRCSAC.load(run.model, device="cpu"), output, task=run.task, env_kwargs=env_kwargs)
+    else:
+        written = export_policy(CRCSAC.load(source, device="cpu"), output)
+    say(f"{written}: {written.stat().st_size / 1e6:.1f} MB")
+
+
+@app.command()
+@in_one_line
+def enjoy(
+    policy: Annotated[Path, typer.Argument(help="file of `sb3-crc export`, of anyone")],
+    task: Annotated[str | None, typer.Option(help="domain-task, if the file does not say")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="how many")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="of the environment")] = 0,
+    film: Annotated[Path | None, typer.Option(help="mp4 file to write, of one more episode")] = None,
+) -> None:
+    """Let an exported policy act by its mean action: print its returns, film it."""
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from sb3_crc.analysis.films import film as record
+    from sb3_crc.envs.dmc import make_dmc
+    from sb3_crc.export import environment_of, load_policy
+
+    acting = load_policy(policy)
+    found, env_kwargs = environment_of(policy) if task is None else (task, {})
+    env = make_vec_env(lambda: make_dmc(found, seed=seed, **env_kwargs), seed=seed)
+    returns, _ = evaluate_policy(acting, env, n_eval_episodes=episodes, return_episode_rewards=True)
+    assert isinstance(returns, list)
+    for episode, value in enumerate(returns):
+        say(f"{found}, episode {episode}: {value:.1f}")
+    if film is not None:
+        say(f"{film}: {record(acting, env, film):.1f}")
+    env.close()
 
 
 @app.command()

@@ -4,15 +4,15 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 
-def film(model: BaseAlgorithm, environment: VecEnv, path: Path, *, max_decisions: int = 1_000) -> float:
+def film(model: PolicyPredictor, environment: VecEnv, path: Path, *, max_decisions: int = 1_000) -> float:
     """
     Film one episode of the deterministic policy, one picture per decision, at the environment's own speed.
 
-    :param model: any SB3 model
+    :param model: any SB3 model, or a policy
     :param environment: one environment that renders ``rgb_array`` and knows its ``render_fps``
     :param path: the file to write, H.264 if it ends in .mp4
     :param max_decisions: stop filming after so many
