@@ -53,21 +53,25 @@ def doctor() -> None:
 @in_one_line
 def export(
     source: Annotated[Path, typer.Argument(help="run of train.py whose training has ended, or zip that CRCSAC has saved")],
-    output: Annotated[Path, typer.Argument(help="file to write, for instance policy.sb3crc")],
+    output: Annotated[Path, typer.Argument(help="policy.sb3crc, or a program for other runtimes: policy.onnx, policy.pt2")],
 ) -> None:
     """Write a policy as safetensors and JSON, which can be read without trust; the zip that it comes from cannot."""
     from sb3_crc import CRCSAC
     from sb3_crc.experiments.runs import Run
     from sb3_crc.export import ENVIRONMENT_ARGUMENTS, export_policy
+    from sb3_crc.programs import ONNX, TORCH, export_program
 
+    about: dict[str, Any] = {}
     if source.is_dir():
         run = Run(source)
-        if not run.model.exists():
-            raise FileNotFoundError(f"{source} has no final policy: its training has not ended")
+        source = run.model
+        if not source.exists():
+            raise FileNotFoundError(f"{run.folder} has no final policy: its training has not ended")
         env_kwargs = {name: value for name, value in run.env_kwargs.items() if name in ENVIRONMENT_ARGUMENTS}
-        written = export_policy(CRCSAC.load(run.model, device="cpu"), output, task=run.task, env_kwargs=env_kwargs)
-    else:
-        written = export_policy(CRCSAC.load(source, device="cpu"), output)
+        about = {"task": run.task, "env_kwargs": env_kwargs}
+    model = CRCSAC.load(source, device="cpu")
+    program = output.suffix in (ONNX, TORCH)
+    written = export_program(model, output) if program else export_policy(model, output, **about)
     say(f"{written}: {written.stat().st_size / 1e6:.1f} MB")
 
 
