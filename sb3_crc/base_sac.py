@@ -1,6 +1,7 @@
 """SB3's SAC as CRCSAC needs it around the algorithm: our policy, four learning rates, counted steps, checked files."""
 
 import io
+import os
 import pathlib
 from collections.abc import Iterable
 from contextlib import nullcontext
@@ -23,7 +24,7 @@ from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
 from sb3_crc.instruments import Speedometer
 from sb3_crc.memory import memory_kept
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
-from sb3_crc.saved_model import check_saved_model
+from sb3_crc.saved_model import add_plain_attributes, check_pickles, check_saved_model, read_saved_attributes
 from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
 from sb3_crc.stacking import stacked_frame_channels
@@ -158,12 +159,16 @@ class BaseCRCSAC(SAC):
     ) -> None:
         """As in SB3, but a file appears whole or not at all: an interrupted save leaves the one that was there before."""
         if isinstance(path, io.BufferedIOBase) or pathlib.Path(path).is_dir():  # SB3 has its own name for the latter
-            return super().save(path, exclude, include)
+            super().save(path, exclude, include)
+            if isinstance(path, io.BufferedIOBase):
+                add_plain_attributes(path, vars(self))
+            return
         target = pathlib.Path(path)
         target = target if target.suffix else target.with_name(f"{target.name}.zip")
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(target) as unfinished:
             super().save(unfinished, exclude, include)
+            add_plain_attributes(unfinished, vars(self))
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
@@ -202,13 +207,21 @@ class BaseCRCSAC(SAC):
         **kwargs: Any,
     ) -> Self:
         """
-        As in SB3.
+        As in SB3, but attributes that have a plain form are read from it and not unpickled. What a file pickles beside that is
+        executed, and named in a warning.
 
-        :raises ValueError: for a file that is not a whole model of CRCSAC, or arguments that it does not have
+        :param safe: among ``kwargs``: refuse to unpickle anything (default: whether SB3_CRC_SAFE_LOAD=1). Attributes that
+            ``custom_objects`` gives are not read at all
+        :raises ValueError: for a file that is not a whole model of CRCSAC, arguments that it does not have, or pickles if that
+            is to be safe
         """
-        known = {*check_saved_model(path), *signature(cls.__init__).parameters}
+        saved = check_saved_model(path)
+        safe = bool(kwargs.pop("safe", os.environ.get("SB3_CRC_SAFE_LOAD") == "1"))
+        known = {*saved, *signature(cls.__init__).parameters, "safe"}
         for key in kwargs:
             check_name("argument of load", key, sorted(known))
+        custom_objects = {**read_saved_attributes(path), **(custom_objects or {})}
+        check_pickles(path, saved, custom_objects, safe=safe)
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
