@@ -42,6 +42,8 @@ EPISODE = 1_000
 MODELS = 5
 #: Logs of a run
 LOGS = 5_000_000
+#: Bytes that a run takes beside what is measured: rl_zoo3, logs, evaluations, checkpoints (two runs of laptop.yml: 0.36, 0.43 GB)
+AROUND = 450_000_000
 #: Share of the free memory that runs may take
 USABLE = 0.9
 #: Processes that draw on one GPU at the same time and are known to work
@@ -148,7 +150,7 @@ def measure(spec: RunSpec) -> Needs:
     on_gpu = model.device.type == "cuda"
     return Needs(
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-        + (0 if on_gpu else frames),
+        + (AROUND if on_gpu else AROUND + frames),
         gpu_memory=int(th.cuda.max_memory_reserved()) + frames if on_gpu else 0,
         disk=frames + MODELS * archive.tell() + LOGS,
         seconds=decisions * deciding
