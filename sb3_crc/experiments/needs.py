@@ -42,7 +42,8 @@ EPISODE = 1_000
 MODELS = 5
 #: Logs of a run
 LOGS = 5_000_000
-#: Bytes that a run takes beside what is measured: rl_zoo3, logs, evaluations, checkpoints (two runs of laptop.yml: 0.36, 0.43 GB)
+#: Bytes that a run takes beside what is measured: rl_zoo3, logs, evaluations, checkpoints (0.36 and 0.43 GB in two runs of
+#: laptop.yml)
 AROUND = 450_000_000
 #: Share of the free memory that runs may take
 USABLE = 0.9
