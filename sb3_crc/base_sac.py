@@ -158,13 +158,14 @@ class BaseCRCSAC(SAC):
         include: Iterable[str] | None = None,
     ) -> None:
         """As in SB3, but a file appears whole or not at all: an interrupted save leaves the one that was there before."""
-        if isinstance(path, io.BufferedIOBase) or pathlib.Path(path).is_dir():  # SB3 has its own name for the latter
+        if isinstance(path, io.BufferedIOBase):
             super().save(path, exclude, include)
-            if isinstance(path, io.BufferedIOBase):
-                add_plain_attributes(path, vars(self))
+            add_plain_attributes(path, vars(self))
             return
         target = pathlib.Path(path)
         target = target if target.suffix else target.with_name(f"{target.name}.zip")
+        if target.is_dir():  # SB3 has its own name for it
+            return super().save(path, exclude, include)
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(target) as unfinished:
             super().save(unfinished, exclude, include)

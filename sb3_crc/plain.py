@@ -8,7 +8,7 @@ import base64
 import io
 import json
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -63,7 +63,7 @@ def to_plain(value: Any) -> Any:
             raise NotPlain(f"{value.__name__} is a class of the user's own")
         return {"type": "class", "name": value.__name__}
     for name, (kind, write, _) in _FORMS.items():
-        if type(value) is kind:
+        if type(value) is kind or (kind is dict and type(value) is OrderedDict):
             return {"type": name, **write(value)}
     if isinstance(value, np.generic) and value.dtype.kind in ARRAY_TYPES:
         return {"type": "scalar", **_write_array(np.asarray(value))}
@@ -206,6 +206,11 @@ _FORMS: dict[str, _Form] = {
         spaces.Dict,
         lambda space: {"items": [[name, to_plain(one)] for name, one in space.spaces.items()]},
         lambda form: spaces.Dict({str(name): from_plain(one) for name, one in form["items"]}),
+    ),
+    "discrete": (
+        spaces.Discrete,
+        lambda space: {"n": int(space.n), "start": int(space.start)},
+        lambda form: spaces.Discrete(int(form["n"]), start=int(form["start"])),
     ),
     "deque": (deque, _write_deque, lambda form: deque(map(from_plain, form["items"]), form["length"])),
     "train_freq": (

@@ -82,6 +82,16 @@ def test_our_own_files_unpickle_nothing(tmp_path: Path, settings: dict[str, Any]
 
 
 @pytest.mark.usefixtures("no_pickles")
+def test_beside_a_folder_of_its_name(tmp_path: Path) -> None:
+    """As rl_zoo3 does it."""
+    (tmp_path / "model").mkdir()
+    model = make_model()
+    model.save(tmp_path / "model")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "model.zip"]
+    CRCSAC.load(tmp_path / "model.zip", device="cpu", safe=True)
+
+
+@pytest.mark.usefixtures("no_pickles")
 def test_streams_and_dicts(tmp_path: Path) -> None:
     env = make_dmc("cartpole-swingup", seed=0, image_size=36, frame_stack=2, render_quality="fast", observation="dict")
     model = CRCSAC("MultiInputPolicy", env, buffer_size=50, policy_kwargs=POLICY_KWARGS, device="cpu")
@@ -140,6 +150,7 @@ VALUES: list[Any] = [
     spaces.Box(-np.inf, np.inf, (3,), np.float32),
     spaces.Box(np.array([0, -1], np.float32), np.array([1, 2], np.float32)),
     spaces.Dict({"pixels": spaces.Box(0, 255, (9, 4, 4), np.uint8), "position": spaces.Box(-1, 1, (2,))}),
+    spaces.Dict({"mode": spaces.Discrete(3, start=1)}),
     TrainFreq(3, TrainFrequencyUnit.EPISODE),
     deque([{"r": 1.5, "l": 3}], maxlen=100),
     {"a": (1, [2, None]), 3: nn.ReLU},

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import submitit  # noqa: F401  # now: it sets logging up, and absl would then close the stderr that a test has in place
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
