@@ -28,6 +28,7 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.image_spaces import image_shape, image_space
+from sb3_crc.plain import unique_keys
 from sb3_crc.policies import CRCPolicy
 
 FORMAT = "sb3_crc policy 1"
@@ -162,7 +163,7 @@ def environment_of(path: str | Path) -> tuple[str, dict[str, Any]]:
         raise FileNotFoundError(f"there is no file {path}")
     try:
         with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("environment", "null"), object_pairs_hook=_unique)
+            about = json.loads((file.metadata() or {}).get("environment", "null"), object_pairs_hook=unique_keys)
     except (SafetensorError, ValueError, RecursionError) as error:
         raise PolicyFileError(f"{path} is no policy, or is damaged: {error}") from error
     if not isinstance(about, dict) or not isinstance(about.get("task"), str) or not isinstance(about.get("env_kwargs"), dict):
@@ -214,7 +215,7 @@ def _read(text: str, source: Path) -> dict[str, Any]:
     try:
         if len(text) > LONGEST:
             raise ValueError(f"{len(text)} characters")
-        given = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse)
+        given = json.loads(text, object_pairs_hook=unique_keys, parse_constant=_refuse)
         if not isinstance(given, dict):
             raise ValueError("no mapping")
         known = {*POLICY_ARGUMENTS, "activation_fn", "features_extractor_kwargs", "observation_space", "action_space"}
@@ -283,13 +284,6 @@ def _numbers(value: Any) -> Iterator[float]:
             yield from _numbers(one)
     elif isinstance(value, int | float):
         yield value
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key is there twice")
-    return found
 
 
 def _refuse(constant: str) -> float:

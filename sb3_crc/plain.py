@@ -109,7 +109,7 @@ def read_plain_attributes(text: str | bytes) -> dict[str, Any]:
     :raises NotPlain: if it is no such text
     """
     try:
-        forms = json.loads(text, object_pairs_hook=_unique)
+        forms = json.loads(text, object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
         raise NotPlain(f"no JSON: {error}") from error
     if not isinstance(forms, dict):
@@ -126,7 +126,8 @@ def _is_json(value: Any) -> bool:
     return True
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """:param pairs: of a JSON mapping, as json.loads hands them over; :raises ValueError: if a key is there twice"""
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key is there twice")

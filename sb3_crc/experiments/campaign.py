@@ -66,8 +66,8 @@ class Campaign:
 
     @property
     def measures(self) -> bool:
-        """Whether it depends on what runs need."""
-        return self.jobs is None if self.engine == "local" else self.memory is None
+        """Whether what runs need is measured first: always on this machine, whose memory and disk they share."""
+        return self.engine == "local" or self.memory is None
 
 
 def parse_assignments(assignments: Sequence[str], flag: str) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 import submitit  # noqa: F401  # now: it sets logging up, and absl would then close the stderr that a test has in place
@@ -21,11 +20,12 @@ from typer.testing import CliRunner
 from sb3_crc.cli import app
 from sb3_crc.experiments.engines.execution import SETTINGS, InUse, RunProcess, finished, plan
 from sb3_crc.experiments.engines.keeping import Keeper
-from sb3_crc.experiments.engines.local import run_locally
+from sb3_crc.experiments.engines.local import Stopped, run_locally
 from sb3_crc.experiments.engines.ray_cluster import RayOptions, connect, run_on_ray
 from sb3_crc.experiments.engines.slurm import JOB, SlurmOptions, run_on_slurm
-from sb3_crc.experiments.runs import FAILURE, SPEC, find_runs, read_json
+from sb3_crc.experiments.runs import FAILURE, SPEC, read_json
 from sb3_crc.experiments.specs import RunSpec, compared
+from tests.experiments.test_compare import results
 from tests.test_zoo import ROOT
 
 TINY = ROOT / "tests" / "tiny.yml"
@@ -35,16 +35,6 @@ Events = list[tuple[str, str]]
 def specs(*presets: str, env_steps: int = 1200, **own: Any) -> list[RunSpec]:
     protocol = {"env_steps": env_steps, "eval_every": 400, "eval_episodes": 1, "conf_file": TINY} | own
     return compared(presets or ["rad"], ["cartpole-swingup"], [0], **protocol)
-
-
-def results(root: Path) -> dict[str, Any]:
-    """What each run came to, but times."""
-    found = {}
-    for run in find_runs([root]):
-        with np.load(run.folder / "evaluations.npz") as data:
-            evaluations = {name: data[name].tolist() for name in data.files if "seconds" not in name}
-        found[run.method] = evaluations, read_json(run.folder / "final.json")["returns"]
-    return found
 
 
 def collector() -> tuple[Events, Callable[[RunSpec, str, str], None]]:
@@ -115,7 +105,22 @@ def test_only_one_command_works_on_a_run(tmp_path: Path) -> None:
     second.wait_until_stopped(time.monotonic() + 60)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="prctl")
+def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(tmp_path: Path) -> None:
+    (spec,) = plan(specs(), tmp_path)
+    half_written = (
+        tmp_path / spec.name / "rad" / "dmc_pixels-cartpole-swingup-v0_1" / "dmc_pixels-cartpole-swingup-v0" / "args.yml"
+    )
+    half_written.parent.mkdir(parents=True)
+    half_written.write_text("!!python/object/apply:collections.Ord")
+    events, report = collector()
+    run = RunProcess(spec, tmp_path, checkpoint_every=1_000, threads=1, report=report)
+    run.start()
+    run.ask_to_stop()
+    run.wait_until_stopped(time.monotonic() + 60)
+    assert events == [("begun", "rad")] and not half_written.exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
 def test_a_training_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
     (spec,) = plan(specs(), tmp_path)
     script = (
@@ -172,7 +177,7 @@ def cluster() -> Iterator[Any]:
 def test_a_node_that_dies_loses_nothing(
     tmp_path: Path, cluster: Any, uninterrupted: dict[str, Any], shared: bool | None
 ) -> None:
-    nodes = [cluster.add_node(num_cpus=1), cluster.add_node(num_cpus=1)]
+    nodes = [cluster.add_node(num_cpus=1, num_gpus=1), cluster.add_node(num_cpus=1, num_gpus=1)]
     runs = specs("crc", "rad", "curl")
     stopped = threading.Event()
 
@@ -186,7 +191,13 @@ def test_a_node_that_dies_loses_nothing(
     killer.start()
     events, report = collector()
     try:
-        failed = run_on_ray(runs, tmp_path, RayOptions(cluster.address, shared=shared), checkpoint_every=25, report=report)
+        failed = run_on_ray(
+            runs,
+            tmp_path,
+            RayOptions(cluster.address, gpus=0.5, memory=10**8, shared=shared),
+            checkpoint_every=25,
+            report=report,
+        )
     finally:
         stopped.set()
         killer.join()
@@ -256,3 +267,67 @@ def test_a_job_that_is_killed_is_submitted_again(tmp_path: Path, uninterrupted: 
         killer.join()
     assert failed == [] and sum(event == "submitted" for event, _ in events) == 2
     assert results(tmp_path) == {"rad": uninterrupted["rad"]}
+
+
+FAKE_SLURM = {
+    # runs the script behind it, as a job that outlives its submission
+    "sbatch": """
+import os, re, subprocess, sys
+script = open(sys.argv[-1]).read()
+open("{folder}/script", "w").write(script)
+size = int((re.search(r"#SBATCH --array=0-(\\d+)", script) or re.search("()", "")).group(1) or -1) + 1
+for task in range(max(1, size)):
+    job = {{"SLURM_JOB_ID": f"7{{task}}", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": str(task)}}
+    job |= {{"SLURM_NTASKS": "1", "SLURM_JOB_NUM_NODES": "1", "SLURM_NODEID": "0", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}}
+    process = subprocess.Popen(["bash", sys.argv[-1]], env=os.environ | job, start_new_session=True, stdout=-3, stderr=-3)
+    open(f"{folder}/7_{{task}}", "w").write(str(process.pid))
+print("Submitted batch job 7")
+""",
+    "srun": """
+import os, sys
+command = sys.argv[1:]
+os.execvp(command[command.index("-u") - 1], command[command.index("-u") - 1 :])
+""",
+    "sacct": """
+import glob, os
+print("JobID|State|NodeList")
+for path in glob.glob("{folder}/7_*"):
+    alive = os.path.exists(f"/proc/{{open(path).read()}}")
+    print(f"{{os.path.basename(path)}}|{{'RUNNING' if alive else 'COMPLETED'}}|here")
+""",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Slurm is played by scripts that read /proc")
+def test_the_same_command_finds_its_jobs_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, Any]
+) -> None:
+    """Slurm itself is played by three scripts; submitit's side of it is real."""
+    for name, text in FAKE_SLURM.items():
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(f"#!{sys.executable}{text.format(folder=tmp_path)}")
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    runs, root = specs("crc", "rad"), tmp_path / "runs"
+    options = SlurmOptions(minutes=60, cpus=1, gpus=0, memory=2 << 30, at_once=2, parameters={"partition": "short"})
+    events, report = collector()
+
+    def interrupt() -> None:
+        while not list(root.rglob("checkpoints/0*/manifest.json")):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(Stopped):
+        run_on_slurm(runs, root, options, checkpoint_every=25, report=report)
+    assert [event for event, _ in events] == ["submitted", "submitted"]
+    script = (tmp_path / "script").read_text()
+    for line in ("--array=0-1%2", "--partition=short", "--cpus-per-task=1", "--mem=2GB", "--time=60", "--signal=USR2@120"):
+        assert f"#SBATCH {line}" in script, script
+
+    assert run_on_slurm(runs, root, options, checkpoint_every=25, report=report) == []
+    found = [remark for event, remark in events if event == "found"]
+    assert found and sum(event == "submitted" for event, _ in events) == 2  # none was submitted again
+    assert sum(event == "finished" for event, _ in events) == len(found)
+    assert results(root) == {method: uninterrupted[method] for method in ("crc", "rad")}

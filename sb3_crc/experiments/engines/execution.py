@@ -104,6 +104,13 @@ class RunProcess:
             self._lock.acquire(timeout=0)
         except Timeout:
             raise InUse(f"{self.folder} is in use by another command") from None
+        try:
+            self._begin()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _begin(self) -> None:
         (self.folder / FAILURE).unlink(missing_ok=True)
         run = self._run_folder()
         zoo = [sys.executable, "-m", "sb3_crc.zoo", "train"]
@@ -212,13 +219,18 @@ def _final_models(run: Path) -> Iterator[Path]:
 
 
 def _wait_until_left(lock: Path) -> None:
-    """A training whose parent was killed may still be saving its last checkpoint."""
+    """
+    A training whose parent was killed may still be saving its last checkpoint.
+
+    :raises InUse: if it does not end
+    """
     if lock.exists():
+        own = FileLock(lock)
         try:
-            with FileLock(lock).acquire(timeout=PATIENCE):
-                pass
-        except (Timeout, OSError):
-            pass  # the training itself will say who has it
+            own.acquire(timeout=PATIENCE)
+        except Timeout:
+            raise InUse(f"{lock.parent.parent} is in use by a training that no command has started") from None
+        own.release()
 
 
 def _libc() -> Any:

@@ -116,6 +116,8 @@ def run_on_slurm(
     attempts = dict.fromkeys(waiting, 1)
 
     def submit(names: Sequence[str]) -> None:
+        if not names:
+            return
         with executor.batch():  # one array
             for name in names:
                 jobs[name] = executor.submit(SlurmRun(waiting[name], root, options.cpus, checkpoint_every))
