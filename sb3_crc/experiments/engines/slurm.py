@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,17 +116,10 @@ def run_on_slurm(
         report(waiting[name], "found", f"in the queue as job {job.job_id}")
     attempts = dict.fromkeys(waiting, 1)
 
-    def submit(names: Sequence[str]) -> None:
-        if not names:
-            return
-        with executor.batch():  # one array
-            for name in names:
-                jobs[name] = executor.submit(SlurmRun(waiting[name], root, options.cpus, checkpoint_every))
-        for name in names:
-            write_json({"job_id": jobs[name].job_id, "cluster": options.cluster}, root / name / JOB)
-            report(waiting[name], "submitted", f"as job {jobs[name].job_id}")
-
-    submit([name for name in waiting if name not in jobs])
+    submit = partial(
+        _submit, root=root, executor=executor, threads=options.cpus, checkpoint_every=checkpoint_every, report=report
+    )
+    jobs |= submit([spec for name, spec in waiting.items() if name not in jobs])
     failed: list[RunSpec] = []
     with caught_signals() as caught:
         while jobs and not caught:
@@ -135,7 +129,7 @@ def run_on_slurm(
                 spec, lost = waiting[name], not _has_result(job)
                 if lost and not finished(root / name) and attempts[name] <= options.retries:
                     attempts[name] += 1
-                    submit([name])
+                    jobs |= submit([spec])
                 elif not _collect(spec, root, job, report):
                     failed.append(spec)
     if caught:
@@ -166,6 +160,22 @@ def _executor(root: Path, options: SlurmOptions) -> Any:
     except (NameError, ValueError, RuntimeError, AssertionError) as error:
         raise ValueError(f"submitit does not take this: {str(error).splitlines()[0]}") from None
     return executor
+
+
+def _submit(
+    specs: Sequence[RunSpec], root: Path, executor: Any, threads: int, checkpoint_every: int, report: Report
+) -> dict[str, Any]:
+    """:return: name of each run -> its job; all are one array"""
+    jobs: dict[str, Any] = {}
+    if not specs:
+        return jobs
+    with executor.batch():
+        for spec in specs:
+            jobs[spec.name] = executor.submit(SlurmRun(spec, root, threads, checkpoint_every))
+    for spec in specs:
+        write_json({"job_id": jobs[spec.name].job_id, "cluster": executor.cluster}, root / spec.name / JOB)
+        report(spec, "submitted", f"as job {jobs[spec.name].job_id}")
+    return jobs
 
 
 def _submitted(folder: Path, files: Path) -> Any:
