@@ -175,19 +175,11 @@ def _read_box(form: Mapping[str, Any]) -> spaces.Box:
     return spaces.Box(low, high, shape, dtype.type)
 
 
-def _write_schedule(schedule: FloatSchedule) -> dict[str, Any]:
-    inner = schedule.value_schedule
-    if type(inner) is ConstantSchedule:
-        return {"constant": float(inner.val)}
-    if type(inner) is LinearSchedule:
-        return {"linear": [float(inner.start), float(inner.end), float(inner.end_fraction)]}
-    raise NotPlain(f"{type(inner).__name__} is a schedule of the user's own")
-
-
 def _read_schedule(form: Mapping[str, Any]) -> FloatSchedule:
-    if "constant" in form:
-        return FloatSchedule(float(form["constant"]))
-    return FloatSchedule(LinearSchedule(*map(float, form["linear"])))
+    inner = from_plain(form["of"])
+    if not isinstance(inner, ConstantSchedule | LinearSchedule):
+        raise ValueError(f"a schedule of {inner!r}")
+    return FloatSchedule(inner)
 
 
 def _write_mapping(mapping: dict[Any, Any]) -> dict[str, Any]:
@@ -219,7 +211,17 @@ _FORMS: dict[str, _Form] = {
         lambda value: {"frequency": value.frequency, "unit": value.unit.value},
         lambda form: TrainFreq(int(form["frequency"]), TrainFrequencyUnit(form["unit"])),
     ),
-    "schedule": (FloatSchedule, _write_schedule, _read_schedule),
+    "schedule": (FloatSchedule, lambda schedule: {"of": to_plain(schedule.value_schedule)}, _read_schedule),
+    "constant": (
+        ConstantSchedule,
+        lambda schedule: {"value": float(schedule.val)},
+        lambda form: ConstantSchedule(float(form["value"])),
+    ),
+    "linear": (
+        LinearSchedule,
+        lambda schedule: {"ends": [float(schedule.start), float(schedule.end), float(schedule.end_fraction)]},
+        lambda form: LinearSchedule(*map(float, form["ends"])),
+    ),
     "list": (
         list,
         lambda value: {"items": [to_plain(one) for one in value]},

@@ -23,6 +23,7 @@ from torch import nn
 from sb3_crc import CRCSAC, FrameReplayBuffer, PixelEncoder, make_dmc
 from sb3_crc.plain import NotPlain, from_plain, read_plain_attributes, to_plain
 from sb3_crc.saved_model import PICKLE, PLAIN
+from sb3_crc.zoo.manager import CRCExperimentManager
 from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 
@@ -79,6 +80,16 @@ def test_our_own_files_unpickle_nothing(tmp_path: Path, settings: dict[str, Any]
             assert mine == theirs or name == "learning_rate", name
     loaded.learn(60, reset_num_timesteps=True)
     assert loaded.lr_schedule(0.5) == model.lr_schedule(0.5)
+
+
+@pytest.mark.parametrize("learning_rate", ["lin_0.001", 0.001])
+def test_what_the_zoo_trains_is_saved_without_pickles(learning_rate: float | str, tmp_path: Path) -> None:
+    settings = CRCExperimentManager._preprocess_schedules({"learning_rate": learning_rate, "batch_size": 8})
+    assert settings["batch_size"] == 8 and callable(settings["learning_rate"])
+    make_model(learning_rate=settings["learning_rate"]).save(tmp_path / "model")
+    loaded = CRCSAC.load(tmp_path / "model", device="cpu", safe=True)
+    share = 0.25 if isinstance(learning_rate, str) else 1
+    assert loaded.lr_schedule(0.25) == pytest.approx(0.001 * share) and loaded.learning_rate(0.25) == loaded.lr_schedule(0.25)  # type: ignore[operator]
 
 
 @pytest.mark.usefixtures("no_pickles")

@@ -17,9 +17,10 @@ import yaml
 from filelock import FileLock
 from optuna.trial import TrialState
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
-from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.utils import LinearSchedule, configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crc.analysis.films import film
@@ -87,6 +88,15 @@ class CRCExperimentManager(ExperimentManager):
             settings |= drawn
         self._configuration = deepcopy(settings)
         return settings, OrderedDict(sorted(deepcopy(settings).items()))
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        """SB3's linear schedule in place of rl_zoo3's: the same rates, and saved without a pickle."""
+        found: dict[str, Any] = ExperimentManager._preprocess_schedules(hyperparams)
+        for name, value in found.items():
+            if isinstance(value, SimpleLinearSchedule):
+                found[name] = LinearSchedule(value.initial_value, 0.0, 1.0)
+        return found
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if "ParallelTrainCallback" in str(hyperparams.get("callback")):
