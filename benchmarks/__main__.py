@@ -162,6 +162,32 @@ def checkpoints(
     publish("checkpoints", f"A checkpoint after every {EVERY} decisions", rows, _command(), folder=output)
 
 
+@app.command()
+def gpu(
+    repeats: Repeats = 10,
+    networks: Annotated[list[str], typer.Option(help="paper, laptop")] = ["paper"],  # noqa: B006
+    batch: Annotated[list[int], typer.Option(help="Batch sizes.")] = [512],  # noqa: B006
+    method: Annotated[list[str] | None, typer.Option(help="Presets beside stock SAC; default: five.")] = None,
+    form: Annotated[list[str] | None, typer.Option(help="How updates are made; default: all four.")] = None,
+    output: Annotated[Path, typer.Option(help="Where the JSON file goes.")] = RESULTS.parent / "gpu",
+) -> None:
+    """CRCSAC.train against stock SB3 SAC on one GPU."""
+    import torch as th
+
+    from benchmarks.gpu import FORMS, METHODS, measure
+
+    if not th.cuda.is_available():
+        raise typer.BadParameter("there is no GPU that torch can use; python -m sb3_crc doctor says what there is")
+    rows = []
+    with console.status("") as status:
+        for network in networks:
+            for size in batch:
+                told = lambda done, size=size: status.update(f"batch {size}: {done} of {repeats}")  # noqa: E731
+                own = {"methods": tuple(method or METHODS), "forms": tuple(form or FORMS)}
+                rows += measure(network, size, repeats=repeats, on_round=told, **own)
+    publish("update", "One update on a GPU", rows, _command(), by=("networks", "batch"), folder=output)
+
+
 @app.command("all")
 def everything(output: Folder = RESULTS) -> None:
     """All of these with their defaults, one after the other: two hours on two cores, which nothing else should use."""

@@ -46,7 +46,7 @@ class Networks:
         arguments["policy_kwargs"] = {**own, **heads, "features_extractor_kwargs": dict(self.encoder)}
         steps = batch_size + EPISODE
         arguments |= {"batch_size": batch_size, "buffer_size": steps, "learning_starts": steps}
-        model = CRCSAC("CnnPolicy", NoiseFrames(self.frame_size), seed=0, device="cpu", **arguments)
+        model = CRCSAC("CnnPolicy", NoiseFrames(self.frame_size), **{"seed": 0, "device": "cpu", **arguments})
         return model.learn(steps)
 
 

@@ -57,7 +57,7 @@ class PlainEncoder(BaseFeaturesExtractor):
         return latents
 
 
-def stock_sac(networks: Networks, batch_size: int, *, channels_last: bool = False) -> SAC:
+def stock_sac(networks: Networks, batch_size: int, *, channels_last: bool = False, device: str = "cpu") -> SAC:
     """:return: SB3's SAC with these networks, ready to be trained on batches of noise"""
     steps = batch_size + EPISODE
     return SAC(
@@ -73,7 +73,7 @@ def stock_sac(networks: Networks, batch_size: int, *, channels_last: bool = Fals
             "features_extractor_kwargs": {**networks.encoder, "channels_last": channels_last},
         },
         seed=0,
-        device="cpu",
+        device=device,
     ).learn(steps)
 
 

@@ -17,6 +17,7 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_crc.settings import check_name
+from sb3_crc.transfers import to_device
 
 ImageSize = int | tuple[int, int]
 
@@ -54,7 +55,9 @@ def random_crop(images: Images, size: ImageSize, *, last_offset: bool = True) ->
     lefts = th.randint(max(1, columns - width + last_offset), (batch,))
     if not isinstance(images, th.Tensor):
         return images.windows(tops, lefts, (height, width))
-    # Slices copy whole rows: four times faster on CPU than one advanced index, and offsets on the host need no device sync
+    if _on_gpu(images):
+        return gather_pixels(images, tops[:, None] + th.arange(height), lefts[:, None] + th.arange(width))
+    # Slices copy whole rows: four times faster on a CPU than one advanced index
     corners = zip(images.unbind(), tops.tolist(), lefts.tolist(), strict=True)
     return th.stack([image[:, top : top + height, left : left + width] for image, top, left in corners])
 
@@ -87,8 +90,30 @@ def random_shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
     """
     if pad < 0:
         raise ValueError(f"random_shift: pad={pad} must be at least 0")
-    height, width = images.shape[2:]
-    return random_crop(F.pad(images, (pad, pad, pad, pad), mode="replicate"), (height, width))
+    batch, _, height, width = images.shape
+    if not _on_gpu(images):
+        return random_crop(F.pad(images, (pad, pad, pad, pad), mode="replicate"), (height, width))
+    tops, lefts = (th.randint(2 * pad + 1, (batch, 1)) for _ in range(2))
+    rows, columns = (th.arange(side) - pad for side in (height, width))
+    return gather_pixels(images, (tops + rows).clamp(0, height - 1), (lefts + columns).clamp(0, width - 1))
+
+
+def _on_gpu(images: th.Tensor) -> bool:
+    return images.device.type != "cpu"
+
+
+def gather_pixels(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:
+    """
+    One piece of work on a GPU, which is not waited for.
+
+    :param images: ``(B, C, H, W)``, on any device
+    :param rows: which of H to take of each sample, ``(B, h)``, on the host
+    :param columns: which of W, ``(B, w)``
+    :return: ``(B, C, h, w)``
+    """
+    rows, columns = (to_device(index, images.device) for index in (rows, columns))
+    batch, channels = (th.arange(length, device=images.device) for length in images.shape[:2])
+    return images[batch[:, None, None, None], channels[:, None, None], rows[:, None, :, None], columns[:, None, None, :]]
 
 
 def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None = None) -> th.Tensor:
@@ -107,8 +132,8 @@ def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None 
     batch, channels, height, width = images.shape
     if channels % 3 != 0:
         raise ValueError(f"random_overlay: needs stacks of RGB frames, got {channels} channels")
-    pictures = _pictures(source, (height, width)).to(images.device)
-    chosen = pictures[th.randint(len(pictures), (batch,)).to(images.device)].repeat(1, channels // 3, 1, 1)
+    pictures = _pictures(source, (height, width), images.device)
+    chosen = pictures[to_device(th.randint(len(pictures), (batch,)), images.device)].repeat(1, channels // 3, 1, 1)
     return th.lerp(images.float(), chosen.float(), alpha).round_().to(th.uint8)
 
 
@@ -140,7 +165,7 @@ def random_conv(images: th.Tensor) -> th.Tensor:
     batch, channels, height, width = images.shape
     if channels % 3 != 0:
         raise ValueError(f"random_conv: needs stacks of RGB frames, got {channels} channels")
-    kernels = th.randn(3 * batch, 3, 3, 3).to(images.device)
+    kernels = to_device(th.randn(3 * batch, 3, 3, 3), images.device)
     frames = images.view(batch, channels // 3, 3, height, width).transpose(0, 1).flatten(1, 2) / 255  # (k, 3 B, H, W)
     recoloured = F.conv2d(F.pad(frames, (1, 1, 1, 1), mode="replicate"), kernels, groups=batch).sigmoid_()
     stacks = recoloured.view(-1, batch, 3, height, width).transpose(0, 1).reshape(images.shape)
@@ -160,8 +185,10 @@ def random_crop_conv(images: Images, size: ImageSize, *, last_offset: bool = Tru
 
 
 @lru_cache(maxsize=4)
-def _pictures(source: str | None, size: tuple[int, int]) -> th.Tensor:
+def _pictures(source: str | None, size: tuple[int, int], device: th.device) -> th.Tensor:
     """:return: uint8 ``(pictures, 3, *size)``"""
+    if device.type != "cpu":
+        return _pictures(source, size, th.device("cpu")).to(device)
     if source is None:
         coarse = th.rand(64, 3, 6, 6, generator=th.Generator().manual_seed(0))
         smooth = F.interpolate(coarse, size, mode="bicubic", align_corners=False)
@@ -221,6 +248,26 @@ def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ..
     if name in CROPS:
         return augmentation
     return lambda images: augmentation(images if isinstance(images, th.Tensor) else images.whole())
+
+
+def augmented_input(
+    name: str, kwargs: Mapping[str, Any] | None, shape: tuple[int, ...], size: tuple[int, int]
+) -> Callable[[Images], th.Tensor]:
+    """
+    As :func:`bind_augmentation`, with what comes out cut to the network's input.
+
+    :param name: in :data:`AUGMENTATIONS`
+    :param kwargs: its arguments, apart from a crop's ``size``, which by default is ``size``
+    :param shape: ``(C, H, W)`` of the frames
+    :param size: height and width of the network's input
+    :return: maps uint8 ``(B, C, H, W)``, stored or a tensor, to uint8 ``(B, C, *size)``
+    :raises ValueError: as :func:`bind_augmentation`, or if what comes out is smaller than the network's input
+    """
+    sized = {"size": size} if takes_size(name) else {}
+    augment = bind_augmentation(name, {**sized, **(kwargs or {})}, shape)
+    with th.random.fork_rng(devices=[]):
+        center_crop(augment(th.zeros(1, *shape, dtype=th.uint8)), size)
+    return lambda images: center_crop(augment(images), size)
 
 
 def takes_size(augmentation: str) -> bool:

@@ -4,7 +4,6 @@ import io
 import os
 import pathlib
 from collections.abc import Iterable
-from contextlib import nullcontext
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -21,9 +20,12 @@ from typing_extensions import Self
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
-from sb3_crc.instruments import Speedometer
+from sb3_crc.convolutions import fastest_convolutions
+from sb3_crc.finite import LossHistory
+from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm, Speedometer
 from sb3_crc.memory import memory_kept
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
+from sb3_crc.recording import RecordedUpdates, unprepare
 from sb3_crc.saved_model import add_plain_attributes, check_pickles, check_saved_model, read_saved_attributes
 from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
@@ -41,19 +43,26 @@ class BaseCRCSAC(SAC):
     qf_learning_rate: LearningRate | None
     encoder_learning_rate: LearningRate | None
     ent_coef_learning_rate: LearningRate | None
+    replay_device: str
     _env_steps: int | None = None
     _frame_channels: int | None = None
     _speedometer: Speedometer
+    _collapse_alarm: CollapseAlarm
+    _recorded: RecordedUpdates | None = None
 
     def between_updates(self) -> None:
         """Called before each update of :meth:`train`; a callback may put a function in its place, to stop there."""
 
     def _setup_model(self) -> None:
         self._speedometer = Speedometer()
+        self._collapse_alarm = CollapseAlarm()
         own = {name: getattr(self, name) for name in ("replay_buffer_class", "replay_buffer_kwargs", "n_steps")}
         self._choose_replay_buffer()
         super()._setup_model()
         vars(self).update(own)  # as the user gave them: load() compares the two
+        buffer = self.replay_buffer
+        if isinstance(buffer, FrameReplayBuffer) and self.replay_device == "auto" and not buffer.fits(self.device):
+            buffer.frame_device = th.device("cpu")
 
     def _choose_replay_buffer(self) -> None:
         is_dict = isinstance(self.observation_space, spaces.Dict)
@@ -63,7 +72,8 @@ class BaseCRCSAC(SAC):
         if issubclass(self.replay_buffer_class, FrameReplayBuffer):
             if self.env is not None:  # a model that is loaded without one has saved what it was
                 self._frame_channels = stacked_frame_channels(self.env)
-            derived = {"frame_channels": self._frame_channels, "n_steps": self.n_steps, "gamma": self.gamma}
+            derived: dict[str, Any] = {"frame_channels": self._frame_channels, "n_steps": self.n_steps, "gamma": self.gamma}
+            derived["frame_device"] = "cpu" if self.replay_device == "cpu" else None
             self.replay_buffer_kwargs = derived | self.replay_buffer_kwargs
             self.n_steps = 1  # SB3 would warn that a class it does not know ignores them
 
@@ -92,19 +102,45 @@ class BaseCRCSAC(SAC):
             kind = "Dict observations" if is_dict else "observations that are one image"
             raise ValueError(f"policy {policy!r} does not suit {kind}: use {needed!r}")
 
-    def _update_learning_rates(self) -> None:
+    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
+        """:return: name of its learning rate -> optimizer, of those that there are"""
         optimizers = {
             "learning_rate": self.actor.optimizer,
             "qf_learning_rate": self.critic.optimizer,
             "encoder_learning_rate": self.policy.encoder_optimizer,
             "ent_coef_learning_rate": self.ent_coef_optimizer,
         }
-        for name, optimizer in optimizers.items():
-            if optimizer is not None:
-                value = self._lr_schedules[name](self._current_progress_remaining)
-                check_learning_rate(name, value)
-                set_learning_rate(optimizer, value)
-                self.logger.record(f"train/{name}", value)
+        return {name: optimizer for name, optimizer in optimizers.items() if optimizer is not None}
+
+    def _update_learning_rates(self) -> None:
+        for name, optimizer in self._optimizers().items():
+            value = self._lr_schedules[name](self._current_progress_remaining)
+            check_learning_rate(name, value)
+            set_learning_rate(optimizer, value)
+            self.logger.record(f"train/{name}", value)
+
+    def _check_stored(self, batch_size: int) -> None:
+        """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
+        assert self.replay_buffer is not None
+        stored = self.replay_buffer.size() * self.replay_buffer.n_envs
+        if batch_size > stored:
+            raise ValueError(
+                f"batch_size={batch_size} is more than the {stored} transitions that are stored: raise learning_starts "
+                f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
+            )
+
+    def _record(self, history: LossHistory, batch_size: int) -> None:
+        """Log the means over one call of :meth:`train`."""
+        means = history.means()
+        if not np.isfinite(list(means.values())).all():
+            assert self.replay_buffer is not None
+            normalize, folder = self._vec_normalize_env, self.logger.dir
+            history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
+        for name, mean in means.items():
+            self.logger.record(name, mean)
+        if "representation/latent_std" in means:
+            self._collapse_alarm.check(means["representation/latent_std"], max(HEALTH_INTERVAL, len(history.updates)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -146,9 +182,10 @@ class BaseCRCSAC(SAC):
     ) -> Self:
         """
         As in SB3; ``total_timesteps`` are agent steps, each of ``action_repeat`` environment steps. On a CPU the process keeps
-        freed memory until the end (:func:`~sb3_crc.memory.memory_kept`).
+        freed memory until the end (:func:`~sb3_crc.memory.memory_kept`), on a GPU it looks for the fastest convolutions
+        (:func:`~sb3_crc.convolutions.fastest_convolutions`).
         """
-        with memory_kept() if self.device.type == "cpu" else nullcontext():
+        with memory_kept() if self.device.type == "cpu" else fastest_convolutions():
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(
@@ -225,6 +262,17 @@ class BaseCRCSAC(SAC):
         check_pickles(path, saved, custom_objects, safe=safe)
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """As in SB3."""
+        super().set_parameters(*args, **kwargs)
+        self.forget_recordings()
+
+    def forget_recordings(self) -> None:
+        """Call after the optimizers were given other states: those that recorded updates wrote to are no longer theirs."""
+        unprepare(self._optimizers().values())
+        if self._recorded is not None:
+            self._recorded.forget()
+
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
@@ -235,6 +283,8 @@ class BaseCRCSAC(SAC):
             "_collapse_alarm",
             "_speedometer",
             "_reads_next",
+            "_recorded",
+            "_weight_tensors",
             "between_updates",
         ]
 

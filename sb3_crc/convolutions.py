@@ -7,6 +7,8 @@ own takes slower paths. docs/performance.md has the figures.
 B batch, C channels, H, W height and width.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch as th
@@ -14,8 +16,40 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from sb3_crc.settings import check_name
+
 Pair = tuple[int, int]
 NO_PADDING = (0, 0)
+#: Types in which convolutions may compute
+PRECISIONS = {"float32": th.float32, "bfloat16": th.bfloat16}
+
+
+def set_precision(networks: nn.Module, precision: str) -> None:
+    """
+    Choose the type in which the convolutions of all encoders and decoders in ``networks`` compute. Weights, latents and images
+    stay float32, and so does all the rest.
+
+    :param precision: in :data:`PRECISIONS`
+    :raises ValueError: for any other
+    """
+    check_name("precision", precision, PRECISIONS)
+    for module in networks.modules():
+        if hasattr(module, "convolution_dtype"):
+            setattr(module, "convolution_dtype", PRECISIONS[precision])  # noqa: B010
+
+
+@contextmanager
+def fastest_convolutions() -> Iterator[None]:
+    """
+    Let cuDNN try which of its algorithms is the fastest for each shape, unless it was told to be deterministic, which SB3 does
+    for a model with a seed.
+    """
+    before = th.backends.cudnn.benchmark
+    th.backends.cudnn.benchmark = not (th.backends.cudnn.deterministic or th.are_deterministic_algorithms_enabled())
+    try:
+        yield
+    finally:
+        th.backends.cudnn.benchmark = before
 
 
 def conv_relu(images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: Pair) -> th.Tensor:
@@ -54,7 +88,7 @@ def conv_transpose(
 
 class ConvReLU(nn.Conv2d):
     """
-    A convolution without padding, and its ReLU.
+    A convolution without padding, and its ReLU, in the type of its input.
 
     :param in_channels: as in Conv2d, like what follows
     """
@@ -65,12 +99,13 @@ class ConvReLU(nn.Conv2d):
     def forward(self, input: th.Tensor) -> th.Tensor:
         """:param input: ``(B, C, H, W)``; :return: as Conv2d, then ReLU"""
         assert self.bias is not None
-        return conv_relu(input, self.weight, self.bias, (self.stride[0], self.stride[1]))
+        weight, bias = self.weight.to(input.dtype), self.bias.to(input.dtype)
+        return conv_relu(input, weight, bias, (self.stride[0], self.stride[1]))
 
 
 class Deconvolution(nn.ConvTranspose2d):
     """
-    A transposed convolution without padding.
+    A transposed convolution without padding, in the type of its input.
 
     :param in_channels: as in ConvTranspose2d, like what follows
     :param size: height and width of the output
@@ -85,7 +120,8 @@ class Deconvolution(nn.ConvTranspose2d):
     def forward(self, input: th.Tensor, output_size: Any = None) -> th.Tensor:
         """:param input: ``(B, C, H, W)``; :return: ``(B, out, *size)``"""
         assert self.bias is not None
-        return conv_transpose(input, self.weight, self.bias, (self.stride[0], self.stride[1]), self.size, relu=self.relu)
+        weight, bias = self.weight.to(input.dtype), self.bias.to(input.dtype)
+        return conv_transpose(input, weight, bias, (self.stride[0], self.stride[1]), self.size, relu=self.relu)
 
 
 class _ConvReLU(th.autograd.Function):

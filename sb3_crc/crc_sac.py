@@ -3,24 +3,25 @@
 B batch, Z latent, A action.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_crc.augmentations import AUGMENTATIONS, Images, ImageSize, bind_augmentation, center_crop, takes_size
+from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, augmented_input, takes_size
 from sb3_crc.base_sac import BaseCRCSAC
 from sb3_crc.buffers import FrameReplayBuffer
+from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory
 from sb3_crc.image_spaces import image_shape, image_space
-from sb3_crc.instruments import CollapseAlarm, watched
+from sb3_crc.instruments import HEALTH_INTERVAL, watched
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
+from sb3_crc.recording import recorded_updates
 from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
 from sb3_crc.schedules import LearningRate
 from sb3_crc.settings import check_name, check_ranges
@@ -30,11 +31,15 @@ from sb3_crc.views import View, Views
 CROP_RATIO = 0.84
 #: Metrics that must stay finite, beside the objectives
 LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")
-#: Updates between two looks at the latent's health
-HEALTH_INTERVAL = 100
 
-ANCHORS = ("augmented", "center_crop")
-BALANCES = ("none", "grad_norm")
+#: Argument -> what it may be
+CHOICES = {
+    "augmentation": tuple(AUGMENTATIONS),
+    "anchor": ("augmented", "center_crop"),
+    "balance": ("none", "grad_norm"),
+    "precision": tuple(PRECISIONS),
+    "replay_device": ("auto", "model", "cpu"),
+}
 
 
 class CRCSAC(BaseCRCSAC):
@@ -81,6 +86,10 @@ class CRCSAC(BaseCRCSAC):
     :param initial_updates: extra updates, made once, with the first ones
     :param reward_scale: factor on the rewards of sampled transitions
     :param max_grad_norm: clip each optimizer's gradient to this norm; None: never
+    :param precision: in which convolutions compute, ``"float32"`` or ``"bfloat16"``; everything else is float32
+    :param compile: on a GPU, record the work of an update once and replay it (:mod:`~sb3_crc.recording`); on a CPU, nothing
+    :param replay_device: where frames are kept: ``"auto"``: beside the networks if they fit there, else in the host's memory;
+        ``"model"``: beside the networks; ``"cpu"``
     :raises ValueError: for observations or settings that cannot work, naming the value and what is allowed
     """
 
@@ -117,6 +126,9 @@ class CRCSAC(BaseCRCSAC):
         initial_updates: int = 0,
         reward_scale: float = 1.0,
         max_grad_norm: float | None = None,
+        precision: str = "float32",
+        compile: bool = False,
+        replay_device: str = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -159,6 +171,9 @@ class CRCSAC(BaseCRCSAC):
         self.initial_updates = initial_updates
         self.reward_scale = reward_scale
         self.max_grad_norm = max_grad_norm
+        self.precision = precision
+        self.compile = compile
+        self.replay_device = replay_device
         if _init_setup_model:
             self._setup_model()
 
@@ -172,7 +187,7 @@ class CRCSAC(BaseCRCSAC):
         check_ranges(self)
         if self.objective_augmentation is not None:
             check_name("objective_augmentation", self.objective_augmentation, AUGMENTATIONS)
-        for name, known in (("augmentation", tuple(AUGMENTATIONS)), ("anchor", ANCHORS), ("balance", BALANCES)):
+        for name, known in CHOICES.items():
             check_name(name, getattr(self, name), known)
         if self.joint_update and self.reencode:
             raise ValueError("joint_update and reencode exclude each other: one encoding for both gradients, or one for each")
@@ -191,25 +206,18 @@ class CRCSAC(BaseCRCSAC):
         }
         super()._setup_model()
         self.policy_kwargs = own_policy_kwargs
+        set_precision(self.policy, self.precision)
         self._reads_next = reads_next(self.policy.objectives, self.replay_buffer, self.n_steps)
 
-        self._collapse_alarm = CollapseAlarm()
-        self._augment = self._to_input(self.augmentation, self.augmentation_kwargs, shape)
-        own = self.objective_augmentation
-        self._augment_query = None if own is None else self._to_input(own, self.objective_augmentation_kwargs, shape)
-        if self.log_ent_coef is not None:
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999))  # CURL's, as SAC+AE's
-
-    def _to_input(
-        self, augmentation: str, kwargs: Mapping[str, Any] | None, shape: tuple[int, ...]
-    ) -> Callable[[Images], th.Tensor]:
-        """:return: maps frames to augmented ones of the network's size; tried once, since frames may be too small"""
         size = self.policy.critic.features_extractor.input_shape[1:]
-        sized = {"size": size} if takes_size(augmentation) else {}
-        augment = bind_augmentation(augmentation, {**sized, **(kwargs or {})}, shape)
-        with th.random.fork_rng(devices=[]):
-            center_crop(augment(th.zeros(1, *shape, dtype=th.uint8)), size)
-        return lambda images: center_crop(augment(images), size)
+        self._augment = augmented_input(self.augmentation, self.augmentation_kwargs, shape, size)
+        own = self.objective_augmentation
+        self._augment_query = None if own is None else augmented_input(own, self.objective_augmentation_kwargs, shape, size)
+        if self.log_ent_coef is not None:
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999), fused=True)  # CURL's
+        self._recorded = recorded_updates(self._update, self._optimizers().values(), self.device) if self.compile else None
+        recorded_weights = self._objective_weights if self._recorded else ()
+        self._weight_tensors = {name: th.zeros((), device=self.device) for name in recorded_weights}
 
     def _network_input(self) -> ImageSize:
         if self.image_size is not None:
@@ -239,24 +247,29 @@ class CRCSAC(BaseCRCSAC):
             self._n_updates += 1
             metrics = history.begin()
             views = self._sample_views(batch_size)
-            with self._instruments(views) as health:
-                metrics |= self._update_critic_and_encoder(views)
-            metrics |= health
-            if self._n_updates % self.policy_delay == 0:
-                metrics |= self._update_actor_and_temperature(views)
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_targets()
+            metrics |= self._replayed(views) if self._recorded is not None else self._update(views)
         self._record(history, batch_size)
 
-    def _check_stored(self, batch_size: int) -> None:
-        """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
-        assert self.replay_buffer is not None
-        stored = self.replay_buffer.size() * self.replay_buffer.n_envs
-        if batch_size > stored:
-            raise ValueError(
-                f"batch_size={batch_size} is more than the {stored} transitions that are stored: raise learning_starts "
-                f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
-            )
+    def _update(self, views: Views) -> dict[str, th.Tensor]:
+        """One update by one batch."""
+        with self._instruments(views) as health:
+            metrics = self._update_critic_and_encoder(views)
+        metrics |= health
+        if self._n_updates % self.policy_delay == 0:
+            metrics |= self._update_actor_and_temperature(views)
+        if self._n_updates % self.target_update_interval == 0:
+            self._update_targets()
+        return metrics
+
+    def _replayed(self, views: Views) -> dict[str, th.Tensor]:
+        """:meth:`_update` by a recording, but where instruments look at it, which wait for the device."""
+        assert self._recorded is not None
+        for name, weight in self._objective_weights.items():
+            self._weight_tensors[name].fill_(weight)
+        if self._n_updates % HEALTH_INTERVAL == 0:
+            return self._update(views)
+        intervals = self.policy_delay, self.target_update_interval, self.auxiliary_interval
+        return self._recorded(views, tuple(self._n_updates % interval == 0 for interval in intervals))
 
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
@@ -317,7 +330,7 @@ class CRCSAC(BaseCRCSAC):
 
     def _auxiliary_gradients(self, views: Views, td_gradient: th.Tensor) -> AuxiliaryGradients:
         policy, balance = self.policy, self.balance == "grad_norm"
-        weights = self._objective_weights
+        weights: Mapping[str, float | th.Tensor] = self._weight_tensors or self._objective_weights
         return auxiliary_gradients(policy.objectives, weights, views, td_gradient, policy.gradient_norms, balance=balance)
 
     def _critic_loss(self, views: Views) -> th.Tensor:
@@ -380,19 +393,6 @@ class CRCSAC(BaseCRCSAC):
             return nullcontext({})
         parts = {"encoder": list(self.critic.features_extractor.parameters()), "q_heads": self.critic.head_parameters()}
         return watched(lambda: views.anchor.leaves, parts)
-
-    def _record(self, history: LossHistory, batch_size: int) -> None:
-        """Log the means over one call of :meth:`train`."""
-        means = history.means()
-        if not np.isfinite(list(means.values())).all():
-            assert self.replay_buffer is not None
-            normalize, folder = self._vec_normalize_env, self.logger.dir
-            history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
-        for name, mean in means.items():
-            self.logger.record(name, mean)
-        if "representation/latent_std" in means:
-            self._collapse_alarm.check(means["representation/latent_std"], max(HEALTH_INTERVAL, len(history.updates)))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
 
 def _parameters(optimizer: th.optim.Optimizer) -> list[th.Tensor]:

@@ -34,6 +34,8 @@ class PixelDecoder(nn.Module):
         kernel_size: int = 3,
     ):
         super().__init__()
+        #: See :func:`~sb3_crc.convolutions.set_precision`
+        self.convolution_dtype = th.float32
         frame_stack, *size = observation_shape
         sizes = [(size[0], size[1])]  # of the encoder's input and of each of its convolutions' output
         for stride in strides:
@@ -55,5 +57,5 @@ class PixelDecoder(nn.Module):
         """:param latents: ``(B, Z)``; :return: images ``(B, C, H, W)``, unbounded floats meant to match pixels / 255"""
         channels, *size = self.start_shape
         start = F.relu(self.linear(latents)).view(-1, *size, channels)
-        images: th.Tensor = self.deconvolutions(start.permute(0, 3, 1, 2))
-        return images
+        images: th.Tensor = self.deconvolutions(start.permute(0, 3, 1, 2).to(self.convolution_dtype))
+        return images.float()

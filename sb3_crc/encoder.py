@@ -77,6 +77,8 @@ class PixelEncoder(BaseFeaturesExtractor):
         self.kernel_size = kernel_size
         self.latent_activation = latent_activation
         self.center_input = center_input
+        #: See :func:`~sb3_crc.convolutions.set_precision`
+        self.convolution_dtype = th.float32
 
         layers: list[nn.Module] = []
         for c_in, c_out, stride in zip((frame_stack, *channels), channels, strides, strict=False):
@@ -122,7 +124,7 @@ class PixelEncoder(BaseFeaturesExtractor):
         images, _ = split_observations(observations, self.observation_space)
         images = center_crop(images, self.input_shape[1:])
         pixels = scale_pixels(images) if images.dtype == th.uint8 else images.contiguous(memory_format=th.channels_last)
-        features: th.Tensor = self.convolutions(pixels)
+        features: th.Tensor = self.convolutions(pixels.to(self.convolution_dtype)).float()
         return features.permute(0, 2, 3, 1).flatten(start_dim=1)  # as they lie in memory
 
     def project(self, features: th.Tensor) -> th.Tensor:
@@ -152,10 +154,9 @@ class MixedConvReLU(ConvReLU):
     def forward(self, input: th.Tensor) -> th.Tensor:
         """:param input: ``(B, C, H, W)``; :return: as ConvReLU"""
         assert self.bias is not None
-        weight = th.einsum("oihw,ij->ojhw", self.weight, self.mixing)
+        weight = th.einsum("oihw,ij->ojhw", self.weight, self.mixing).contiguous(memory_format=th.channels_last)
         bias = self.bias - self.weight.sum(dim=(2, 3)) @ self.shift
-        stride = self.stride[0], self.stride[1]
-        return conv_relu(input, weight.contiguous(memory_format=th.channels_last), bias, stride)
+        return conv_relu(input, weight.to(input.dtype), bias.to(input.dtype), (self.stride[0], self.stride[1]))
 
 
 def difference_mixing(channels: int, frame_channels: int, factor: float) -> th.Tensor:

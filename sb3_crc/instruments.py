@@ -10,6 +10,8 @@ from contextlib import contextmanager
 
 import torch as th
 
+#: Updates between two looks at the latent's health
+HEALTH_INTERVAL = 100
 #: A standard deviation of the latent over the batch below which it counts as collapsed
 COLLAPSED_STD = 0.02
 #: Updates for which it may stay so before the user is warned

@@ -56,7 +56,8 @@ def export_program(model: CRCSAC | CRCPolicy, path: str | Path) -> Path:
         raise ValueError(f"{target}: a program is written to a file that ends in {ONNX} or {TORCH}")
     if not isinstance(policy.observation_space, spaces.Box):
         raise ValueError(f"a program takes images alone; the policy was made for {policy.observation_space}")
-    was_training, device = policy.training, policy.device
+    was_training, device, own_type = policy.training, policy.device, policy.actor.features_extractor.convolution_dtype
+    policy.actor.features_extractor.convolution_dtype = th.float32
     acting = DeterministicActions(policy).cpu().eval()
     bytes_of_pixels = np.random.default_rng(0).integers(0, 256, (4, *policy.observation_space.shape), np.uint8)
     observations = th.as_tensor(bytes_of_pixels)
@@ -65,6 +66,7 @@ def export_program(model: CRCSAC | CRCPolicy, path: str | Path) -> Path:
             wanted = acting(observations)
             program = th.export.export(acting, (observations,), dynamic_shapes=({0: th.export.Dim("batch")},))
     finally:
+        policy.actor.features_extractor.convolution_dtype = own_type
         policy.to(device)
         policy.set_training_mode(was_training)
     with atomic_write(target) as unfinished:

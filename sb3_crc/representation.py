@@ -35,7 +35,7 @@ class AuxiliaryGradients:
 
 def auxiliary_gradients(
     objectives: nn.ModuleDict,
-    weights: Mapping[str, float],
+    weights: Mapping[str, float | th.Tensor],
     views: Views,
     td_gradient: th.Tensor,
     gradient_norms: th.Tensor,
@@ -46,7 +46,7 @@ def auxiliary_gradients(
     Differentiate each objective down to the latent, where their sizes and directions can be compared.
 
     :param objectives: name -> objective
-    :param weights: name -> weight
+    :param weights: name -> weight, a number or a scalar on the device
     :param views: of one batch
     :param td_gradient: of the critic loss at the latent, ``(B, Z)``, to compare directions with
     :param gradient_norms: moving average of each objective's gradient norm at the latent, updated in place

@@ -34,4 +34,8 @@ def check_learning_rate(name: str, value: float) -> None:
 def set_learning_rate(optimizer: th.optim.Optimizer, learning_rate: float) -> None:
     """Set the rate of every parameter group, times the group's ``lr_factor`` if it has one."""
     for group in optimizer.param_groups:
-        group["lr"] = learning_rate * group.get("lr_factor", 1)
+        value = learning_rate * group.get("lr_factor", 1)
+        if isinstance(group["lr"], th.Tensor):  # read by recorded updates, where it lies
+            group["lr"].fill_(value)
+        else:
+            group["lr"] = value

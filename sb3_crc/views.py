@@ -32,9 +32,9 @@ B batch, C channels (of the whole frame stack), H, W height and width of the enc
 output, Z latent, P proprioception, A action. With ``n_steps=1``, next and bootstrap are one view.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from functools import cached_property, reduce
-from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
@@ -43,6 +43,9 @@ from sb3_crc.augmentations import Images, center_crop
 from sb3_crc.buffers.samples import FrameSamples
 from sb3_crc.encoder import PixelEncoder, scale_pixels
 from sb3_crc.image_spaces import split_observations
+
+#: What is read of a batch beside its images
+COMMON = ("actions", "rewards", "discounts")
 
 
 class View:
@@ -184,12 +187,14 @@ class Views:
         self.rewards = batch.rewards * reward_scale  # (B, 1)
         discounts = gamma if batch.discounts is None else batch.discounts
         self.discounts = (1 - batch.dones) * discounts  # (B, 1), zero where the episode has terminated
+        #: Name of each view that was asked for -> its images, and proprioception or None
+        self.drawn: dict[str, tuple[th.Tensor, th.Tensor | None]] = {}
 
     @cached_property
     def anchors(self) -> list[View]:
         """Augmentations of o_t, the views whose online encodings carry gradients."""
         augment = self._augment if self._augment_anchor else self._middle
-        return [self._view(self._batch.observations, augment, trains_encoder=True) for _ in range(self._n_anchors)]
+        return [self._view(f"anchors/{i}", "observations", augment, trains_encoder=True) for i in range(self._n_anchors)]
 
     @property
     def anchor(self) -> View:
@@ -201,32 +206,32 @@ class Views:
         """What the objectives train the encoder through: the anchor, or o_t in an augmentation of their own."""
         if self._augment_query is None:
             return self.anchor
-        return self._view(self._batch.observations, self._augment_query, trains_encoder=True)
+        return self._view("query", "observations", self._augment_query, trains_encoder=True)
 
     @cached_property
     def positive(self) -> View:
         """o_t again, augmented independently of the anchor."""
-        return self._view(self._batch.observations, self._augment)
+        return self._view("positive", "observations", self._augment)
 
     @cached_property
     def clean(self) -> View:
         """The middle of o_t, not augmented."""
-        return self._view(self._batch.observations, self._middle)
+        return self._view("clean", "observations", self._middle)
 
     @cached_property
     def next(self) -> View:
         """Augmented o_{t+1}."""
         if not self._offers_next:
             raise RuntimeError("an objective that reads views.next must declare it: reads_next = True in its class")
-        observations = getattr(self._batch, "one_step_observations", self._batch.next_observations)
-        if observations is self._batch.next_observations:
+        one_step = getattr(self._batch, "one_step_observations", self._batch.next_observations)
+        if one_step is self._batch.next_observations:
             return self.bootstrap
-        return self._view(observations, self._augment)
+        return self._view("next", "one_step_observations", self._augment)
 
     @cached_property
     def bootstraps(self) -> list[View]:
         """Augmentations of o_{t+n}, from which the return is bootstrapped."""
-        return [self._view(self._batch.next_observations, self._augment) for _ in range(self._n_bootstraps)]
+        return [self._view(f"bootstraps/{i}", "next_observations", self._augment) for i in range(self._n_bootstraps)]
 
     @property
     def bootstrap(self) -> View:
@@ -267,9 +272,38 @@ class Views:
         for view in (*self.anchors, self.query):
             view.forget_encoding()
 
-    def _view(self, observations: Any, augment: Callable[[Images], th.Tensor], *, trains_encoder: bool = False) -> View:
-        images, proprioception = split_observations(observations, self._observation_space)
-        return View(augment(images), *self._encoders, trains_encoder=trains_encoder, proprioception=proprioception)
+    def draw(self, names: Iterable[str]) -> None:
+        """:param names: keys of ``drawn`` of other views of this kind, whose images are to be drawn now, in this order"""
+        for name in names:
+            getattr(self, name.partition("/")[0])
+
+    def tensors(self) -> dict[str, th.Tensor]:
+        """:return: all that was drawn and all that is read beside it, by name"""
+        tensors = {name: getattr(self, name) for name in COMMON}
+        for name, (images, proprioception) in self.drawn.items():
+            tensors[name] = images
+            if proprioception is not None:
+                tensors[f"{name}/proprioception"] = proprioception
+        return tensors
+
+    def of(self, tensors: Mapping[str, th.Tensor]) -> "Views":
+        """:param tensors: as :meth:`tensors` returns them; :return: views of these, not encoded yet"""
+        other = copy(self)
+        for name in ("anchors", "query", "positive", "clean", "next", "bootstraps"):
+            other.__dict__.pop(name, None)
+        for name in COMMON:
+            setattr(other, name, tensors[name])
+        other.drawn = {name: (tensors[name], tensors.get(f"{name}/proprioception")) for name in self.drawn}
+        return other
+
+    def _view(
+        self, name: str, observations: str, augment: Callable[[Images], th.Tensor], *, trains_encoder: bool = False
+    ) -> View:
+        if name not in self.drawn:
+            images, proprioception = split_observations(getattr(self._batch, observations), self._observation_space)
+            self.drawn[name] = augment(images), proprioception
+        images, proprioception = self.drawn[name]
+        return View(images, *self._encoders, trains_encoder=trains_encoder, proprioception=proprioception)
 
     def _middle(self, images: Images) -> th.Tensor:
         return center_crop(images, self._size)

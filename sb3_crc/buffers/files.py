@@ -314,6 +314,7 @@ def _read_pickle(buffer: FrameReplayBuffer, source: Path | io.BufferedIOBase) ->
     if isinstance(other, FrameReplayBuffer):
         loaded = other
         loaded.n_steps, loaded.gamma, loaded.device = buffer.n_steps, buffer.gamma, buffer.device
+        loaded.frame_device = buffer.frame_device
     else:
         loaded = buffer.empty_copy(other.buffer_size * other.n_envs, buffer.frame_channels)
         oldest = other.pos if other.full else 0

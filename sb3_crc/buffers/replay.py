@@ -3,7 +3,6 @@
 B batch, k frames in a stack, C channels of a frame, H, W height and width, A action, N ``n_envs``.
 """
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -14,13 +13,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from typing_extensions import Self
 
+from sb3_crc.buffers.placement import PlacedReplayBuffer
 from sb3_crc.buffers.rows import as_row, n_step_returns, same_bytes
 from sb3_crc.buffers.samples import FrameSamples, whole
 from sb3_crc.buffers.store import SLACK, FrameStacks, FrameStore
-from sb3_crc.memory import GIGABYTE, free_memory
-
-#: Share of the free memory that a buffer which "would fit" takes: the rest is the training's
-USABLE = 0.9
 
 
 class Latest(NamedTuple):
@@ -30,12 +26,12 @@ class Latest(NamedTuple):
     numbers: list[int] = []  # noqa: RUF012  # never written to
 
 
-class FrameReplayBuffer(ReplayBuffer):
+class FrameReplayBuffer(PlacedReplayBuffer):
     """
     SB3's ReplayBuffer, and its NStepReplayBuffer, in a sixth of the memory for stacks of three frames: each frame is stored
     once, and a transition keeps the numbers of its frames. The same transitions are sampled with the same random numbers.
 
-    The frames lie on ``device``. They take memory as they come, not before.
+    The frames lie on ``frame_device``. They take memory as they come, not before; on a GPU all of it with the first.
 
     A transition whose observation is not the one that the previous transition led to starts a new trajectory, whether the
     previous one was done or the environment was reset early; n-step returns end there and bootstrap.
@@ -43,7 +39,7 @@ class FrameReplayBuffer(ReplayBuffer):
     :param buffer_size: capacity in transitions
     :param observation_space: a Box
     :param action_space: as in SB3
-    :param device: where frames are stored and samples returned
+    :param device: where samples are returned
     :param n_envs: number N of environments
     :param optimize_memory_usage: must be False: there is nothing left to optimise
     :param handle_timeout_termination: as in SB3: a time limit is no termination
@@ -51,6 +47,7 @@ class FrameReplayBuffer(ReplayBuffer):
         last; None: observations are stored whole (and once, not as both obs and next_obs)
     :param n_steps: rewards that are summed before the return is bootstrapped
     :param gamma: discount in that sum
+    :param frame_device: where frames are stored; None: on ``device``
     :raises ValueError: for arguments that cannot work, naming the value and what is allowed
     """
 
@@ -67,7 +64,9 @@ class FrameReplayBuffer(ReplayBuffer):
         frame_channels: int | None = None,
         n_steps: int = 1,
         gamma: float = 0.99,
+        frame_device: th.device | str | None = None,
     ):
+        self._frame_device = None if frame_device is None else th.device(frame_device)
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs)
         if optimize_memory_usage:
             raise ValueError(f"optimize_memory_usage=True is not supported by {type(self).__name__}: frames are stored once")
@@ -85,7 +84,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.stack_size, frame_shape = _frames_of(space.shape, frame_channels)
         transitions = self.buffer_size * n_envs
         capacity = transitions + round(SLACK * transitions) + n_envs * (self.stack_size + 1)
-        self.store = FrameStore(frame_shape, space.dtype, capacity, self.device)
+        self.store = FrameStore(frame_shape, space.dtype, capacity, self.frame_device)
 
         rows = self.buffer_size, n_envs
         #: Numbers of the frames of each transition: o_t is all but the last, o_{t+1} all but the first
@@ -100,42 +99,6 @@ class FrameReplayBuffer(ReplayBuffer):
         self.latest = [Latest()] * n_envs
         #: Files of :mod:`~sb3_crc.buffers.files` that hold frames of this buffer
         self.segments: tuple[Any, ...] = ()
-        self._warned = False
-
-    # -- Memory --------------------------------------------------------------------------------------------------------
-
-    @property
-    def device(self) -> th.device:
-        """Where the frames lie and samples are returned; SB3's ``load_replay_buffer`` writes it."""
-        return self._device
-
-    @device.setter
-    def device(self, device: th.device | str) -> None:
-        """Move the frames there."""
-        self._device = th.device(device)
-        if hasattr(self, "store"):
-            self.store.to(self._device)
-
-    @property
-    def full_bytes(self) -> int:
-        """What the frames of a full buffer need, with the slack that is kept for the first frames of episodes."""
-        return self.store.capacity * self.store.frame_bytes
-
-    def warn_if_too_large(self) -> None:
-        """Warn, once, if the full buffer will not fit in free memory, with the size that would."""
-        if self._warned:
-            return
-        self._warned = True
-        taken = self.store.taken_bytes
-        available = free_memory(self.device) + taken
-        if self.full_bytes > available:
-            fits = int(USABLE * available / self.full_bytes * self.buffer_size * self.n_envs)
-            warnings.warn(
-                f"the replay buffer needs {self.full_bytes / GIGABYTE:.2f} GB when its {self.buffer_size * self.n_envs} "
-                f"transitions are full, but only {available / GIGABYTE:.2f} GB are free on {self.device}: "
-                f"training may be killed then; buffer_size={fits} would fit",
-                stacklevel=2,
-            )
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_warned": False}
@@ -167,6 +130,7 @@ class FrameReplayBuffer(ReplayBuffer):
             frame_channels=frame_channels,
             n_steps=self.n_steps,
             gamma=self.gamma,
+            frame_device=self._frame_device,
         )
 
     def restore(self, arrays: Mapping[str, np.ndarray], pos: int, *, full: bool, latest: list[list[int]]) -> None:
@@ -355,7 +319,7 @@ class FrameReplayBuffer(ReplayBuffer):
 
     def _frame_stacks(self, rows: np.ndarray, envs: np.ndarray, following: bool) -> FrameStacks:
         numbers = self.frame_numbers[rows, envs]
-        return FrameStacks(self.store, numbers[:, 1:] if following else numbers[:, :-1])
+        return FrameStacks(self.store, numbers[:, 1:] if following else numbers[:, :-1], self.device)
 
     # -- What DictFrameReplayBuffer does otherwise ---------------------------------------------------------------------
 

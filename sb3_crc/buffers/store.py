@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_crc.transfers import to_device
+
 #: More frames than transitions that a new store has room for, as a share of these: each episode has one more
 SLACK = 1 / 64
 #: Share by which a full store grows
@@ -71,7 +73,7 @@ class FrameStore:
         """
         if len(self) == self.capacity:
             self._grow(1)
-        self.allocate()[self.end % self.capacity] = th.from_numpy(np.array(frame))
+        self.allocate()[self.end % self.capacity] = to_device(np.array(frame), self.device)
         self.end += 1
         return self.end - 1
 
@@ -107,7 +109,7 @@ class FrameStore:
         if self.device.type == "cpu":  # numpy copies whole frames, several times faster than torch's index
             gathered = th.from_numpy(frames.numpy()[places])
         else:
-            gathered = frames[th.from_numpy(places).to(frames.device)]
+            gathered = frames[to_device(places, frames.device)]
         return _side_by_side(gathered)
 
     def windows(self, numbers: np.ndarray, tops: np.ndarray, lefts: np.ndarray, size: tuple[int, int]) -> th.Tensor:
@@ -124,7 +126,7 @@ class FrameStore:
         if self.device.type == "cpu":
             views = np.lib.stride_tricks.sliding_window_view(frames.numpy(), size, axis=(2, 3))
             return _side_by_side(th.from_numpy(views[places, :, tops[:, None], lefts[:, None]]))
-        at = [th.from_numpy(index).to(frames.device) for index in (places, tops, lefts)]
+        at = [to_device(index, frames.device) for index in (places, tops, lefts)]
         rows = at[1][:, None, None, None, None] + th.arange(size[0], device=frames.device)[:, None]  # (B, 1, 1, h, 1)
         columns = at[2][:, None, None, None, None] + th.arange(size[1], device=frames.device)  # (B, 1, 1, 1, w)
         channels = th.arange(self.shape[0], device=frames.device)[:, None, None]
@@ -172,11 +174,13 @@ class FrameStacks:
 
     :param store: the frames
     :param numbers: of the frames of each stack, ``(B, k)``
+    :param device: where what is read is needed; None: where the frames lie
     """
 
-    def __init__(self, store: FrameStore, numbers: np.ndarray):
+    def __init__(self, store: FrameStore, numbers: np.ndarray, device: th.device | None = None):
         self._store = store
         self.numbers = numbers
+        self._device = device
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -187,12 +191,12 @@ class FrameStacks:
 
     @property
     def device(self) -> th.device:
-        """Where the frames lie, and what is cut out of them."""
-        return self._store.device
+        """Where what is read comes to lie."""
+        return self._store.device if self._device is None else self._device
 
     def whole(self) -> th.Tensor:
         """:return: the stacks, ``(B, k C, H, W)``"""
-        return self._store.stacks(self.numbers)
+        return to_device(self._store.stacks(self.numbers), self.device)
 
     def windows(self, tops: th.Tensor, lefts: th.Tensor, size: tuple[int, int]) -> th.Tensor:
         """
@@ -201,7 +205,7 @@ class FrameStacks:
         :param size: height and width of the windows
         :return: ``(B, k C, *size)``
         """
-        return self._store.windows(self.numbers, tops.numpy(), lefts.numpy(), size)
+        return to_device(self._store.windows(self.numbers, tops.numpy(), lefts.numpy(), size), self.device)
 
 
 def _side_by_side(frames: th.Tensor) -> th.Tensor:

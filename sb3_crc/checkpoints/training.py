@@ -69,6 +69,8 @@ def set_training_state(model: OffPolicyAlgorithm, callback: BaseCallback, state:
     start = model._last_obs, model._last_original_obs
     for name, value in state["networks"].items():
         _load(name, recursive_getattr(model, name), copied(value))
+    if hasattr(model, "forget_recordings"):
+        model.forget_recordings()
     for name, value in state["variables"].items():
         recursive_getattr(model, name).data.copy_(value)
     for name, value in state["counters"].items():

@@ -8,6 +8,7 @@ file is also that subprocess's script; run as one it loads MuJoCo, and it import
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import importlib
 import json
 import logging
@@ -17,12 +18,17 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 logger = logging.getLogger(__name__)
 
+#: Environment variable: seconds in which the first frame must be there
+FIRST_FRAME = "SB3_CRC_FIRST_FRAME"
+#: What faulthandler writes when it ends the process
+NO_FRAME = "Timeout ("
 PROBE_TIMEOUT = 30.0  # seconds: software drivers compile shaders at the first frame, broken ones hang
 DEBIAN_PACKAGES = {
     "egl": ("libegl1", "libopengl0", "libgl1-mesa-dri"),  # PyOpenGL loads libOpenGL beside libEGL
@@ -123,6 +129,23 @@ def select_backend() -> str:
         # Imported first and without MUJOCO_GL, dm_control binds GLFW, which aborts the process where there is no display.
         importlib.reload(loaded)
     return backend
+
+
+@contextlib.contextmanager
+def first_frame_watched() -> Iterator[None]:
+    """
+    Within it the process ends with :data:`NO_FRAME` in its error output if the frame takes longer than as many seconds as
+    SB3_CRC_FIRST_FRAME says, however the driver hangs; without that variable nothing happens.
+    """
+    seconds = os.environ.get(FIRST_FRAME)
+    if not seconds:
+        yield
+        return
+    faulthandler.dump_traceback_later(float(seconds), exit=True)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def prove_backend() -> Probe:

@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.rendering import RenderingUnavailable, select_backend
+from sb3_crc.envs.rendering import RenderingUnavailable, first_frame_watched, select_backend
 from sb3_crc.envs.state import State, read_task, write_task
 
 LARGE_PICTURE = 480  # side of render()'s picture in pixels: all that fits the suite's 640 x 480 off-screen buffer
@@ -141,6 +141,8 @@ class SimulatorStep(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             from dm_control.mujoco.engine import Camera
 
             self._camera = Camera(self.get_wrapper_attr("physics"), **size_and_camera)
+            with first_frame_watched():  # a driver that hangs does so here
+                self._camera.render(render_flag_overrides=flags)
         if segmentation:
             return self._camera.render(segmentation=True)
         return self._camera.render(render_flag_overrides=flags)

@@ -8,11 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch as th
+
 from sb3_crc.atomic import atomic_write
 from sb3_crc.console import console, errors, say
+from sb3_crc.envs.rendering import probe
 from sb3_crc.experiments.engines.execution import finished
 from sb3_crc.experiments.engines.local import run_locally, threads_each, usable_cores
-from sb3_crc.experiments.needs import Needs, check_disk, measure_needs, most_at_once, seconds_for_all
+from sb3_crc.experiments.needs import RENDERERS, Needs, check_disk, measure_needs, most_at_once, seconds_for_all
 from sb3_crc.experiments.runs import find_runs
 from sb3_crc.experiments.specs import RunSpec
 from sb3_crc.experiments.watching import Progress, progress_table, read_progress
@@ -28,6 +31,7 @@ OWN_OPTIONS = {
     "gpus": ("ray", "slurm"),
     "memory": ("ray", "slurm"),
     "slurm": ("slurm",),
+    "pack": ("local",),
 }
 
 
@@ -44,6 +48,8 @@ class Campaign:
     :param memory: gigabytes of each run; None: what is measured
     :param slurm: parameters of submitit's SlurmExecutor, and ``cluster``
     :param checkpoint_every: agent steps between two checkpoints of a run
+    :param pack: fill a GPU: as many runs as its memory and the cores allow, of which a few draw on it
+        (:data:`~sb3_crc.experiments.needs.RENDERERS`) and the others with OSMesa
     :raises ValueError: for an unknown engine, an option that it does not have, or a value that cannot work
     """
 
@@ -55,6 +61,7 @@ class Campaign:
     memory: float | None = None
     slurm: Mapping[str, Any] = field(default_factory=dict)
     checkpoint_every: int = 1_000
+    pack: bool | None = None
 
     def __post_init__(self) -> None:
         check_name("--engine", self.engine, ENGINES)
@@ -63,6 +70,8 @@ class Campaign:
                 raise ValueError(f"--{name} is an option of --engine {' and '.join(engines)}; this is --engine {self.engine}")
         if self.engine == "slurm" and self.gpus is not None and self.gpus != round(self.gpus):
             raise ValueError(f"--gpus {self.gpus}: Slurm gives whole GPUs")
+        if self.pack and not th.cuda.is_available():
+            raise ValueError("--pack fills a GPU, and there is none that torch can use; `python -m sb3_crc doctor` shows more")
 
     @property
     def measures(self) -> bool:
@@ -181,7 +190,7 @@ def _engine(how: Campaign, jobs: int, needs: Mapping[str, Needs]) -> Callable[..
             parameters=parameters,
         )
         return partial(run_on_slurm, options=options)
-    return partial(run_locally, jobs=jobs)
+    return partial(run_locally, jobs=jobs, renderers=RENDERERS if how.pack else None)
 
 
 def _resources(waiting: Sequence[RunSpec], how: Campaign) -> tuple[int, int, dict[str, Needs], dict[str, str]]:
@@ -192,7 +201,8 @@ def _resources(waiting: Sequence[RunSpec], how: Campaign) -> tuple[int, int, dic
     threads = threads_each(likely) if how.engine == "local" else how.cpus or 1
     say(f"measuring what runs need: a few seconds of each kind, with {threads} threads", errors)
     needs, reasons = measure_needs(waiting, threads)
-    jobs = how.jobs or min(len(waiting), most_at_once(list(needs.values())))
+    drawing = None if how.pack and probe("osmesa").draws else RENDERERS
+    jobs = how.jobs or min(len(waiting), most_at_once(list(needs.values()), renderers=drawing))
     return jobs, threads_each(jobs) if how.engine == "local" else threads, needs, reasons
 
 

@@ -77,6 +77,9 @@ def sweep(
     memory: Memory = None,
     slurm: Slurm = None,
     checkpoint_every: Every = 1_000,
+    pack: Annotated[
+        bool, typer.Option("--pack", help="local: fill a GPU with runs, of which four draw on it and the others on the CPU")
+    ] = False,
     dry_run: DryRun = False,
 ) -> None:
     """Train the variants of a sweep file as `compare` does its presets. The same command goes on."""
@@ -85,6 +88,7 @@ def sweep(
     conf_file = None if conf_file is None else conf_file.absolute()
     specs = read_sweep(file, seeds=seeds, env_steps=env_steps, conf_file=conf_file)
     how = {"engine": engine, "jobs": jobs, "address": address, "cpus": cpus, "gpus": gpus, "memory": memory, "slurm": slurm}
+    how["pack"] = pack or None
     _run(specs, output, dry_run, checkpoint_every=checkpoint_every, **how)
 
 

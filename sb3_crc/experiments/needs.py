@@ -91,13 +91,19 @@ def measure_needs(specs: Sequence[RunSpec], threads: int) -> tuple[dict[str, Nee
 
 
 def most_at_once(
-    needs: Sequence[Needs], *, cores: int | None = None, free: int | None = None, free_gpu: int | None = None
+    needs: Sequence[Needs],
+    *,
+    cores: int | None = None,
+    free: int | None = None,
+    free_gpu: int | None = None,
+    renderers: int | None = RENDERERS,
 ) -> int:
     """
     :param needs: of the runs that are to be done
     :param cores: None: those of this process
     :param free: bytes of memory; None: what is free now
     :param free_gpu: bytes on the GPU; None: what is free now
+    :param renderers: how many processes may draw on the GPU; None: who has no place there draws elsewhere
     :return: how many of them may run at the same time, at least one: each has a core, its memory and, on a GPU, a renderer
     """
     limits = [usable_cores() if cores is None else cores]
@@ -105,7 +111,7 @@ def most_at_once(
         limits.append(int(USABLE * (available_memory() if free is None else free)) // largest)
     if on_gpu := max((one.gpu_memory for one in needs), default=0):
         there = int(th.cuda.mem_get_info()[0]) if free_gpu is None else free_gpu
-        limits += [int(USABLE * there) // on_gpu, RENDERERS]
+        limits += [int(USABLE * there) // on_gpu, *([] if renderers is None else [renderers])]
     return max(1, min(limits))
 
 

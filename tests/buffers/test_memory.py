@@ -15,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_crc import CRCSAC
-from sb3_crc.buffers import FrameReplayBuffer, replay
+from sb3_crc.buffers import FrameReplayBuffer, placement
 from tests.buffers.test_training import SETTINGS, StackEnv
 from tests.buffers.worlds import ACTIONS, World, fill
 
@@ -108,7 +108,7 @@ def test_100_000_transitions_of_three_frames_fit_in_3_2_gb(capsys: pytest.Captur
 
 
 def free(monkeypatch: pytest.MonkeyPatch, gigabytes: float) -> None:
-    monkeypatch.setattr(replay, "free_memory", lambda device: int(gigabytes * 1e9))
+    monkeypatch.setattr(placement, "free_memory", lambda device: int(gigabytes * 1e9))
 
 
 def test_the_warning_names_what_is_needed_what_is_free_and_what_would_fit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +155,7 @@ def test_what_is_taken_already_need_not_be_free(monkeypatch: pytest.MonkeyPatch,
 
 def test_the_gpu_is_asked_where_the_frames_lie_there(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[th.device] = []
-    monkeypatch.setattr(replay, "free_memory", lambda device: asked.append(device) or 10**12)
+    monkeypatch.setattr(placement, "free_memory", lambda device: asked.append(device) or 10**12)
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
     FrameReplayBuffer(10, SPACE, ACTIONS, "cuda", frame_channels=3).warn_if_too_large()
     assert [device.type for device in asked] == ["cuda"]

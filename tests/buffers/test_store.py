@@ -167,7 +167,7 @@ def test_the_way_of_a_gpu_gathers_the_same() -> None:
     """On one, torch indexes; here it does so where the frames lie."""
     lying, tops, lefts = stacks(), th.arange(16) % 3, th.arange(16) % 6
     expected = lying.whole(), lying.windows(tops, lefts, (4, 3))
-    lying._store.device = th.device("cuda")
+    lying._store.device, lying._device = th.device("cuda"), th.device("cpu")
     assert_same(lying.whole(), expected[0])
     assert_same(lying.windows(tops, lefts, (4, 3)), expected[1])
 

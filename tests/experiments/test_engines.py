@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -172,6 +173,18 @@ def cluster() -> Iterator[Any]:
         found.shutdown()
 
 
+def node_of(spec: RunSpec, nodes: list[Any]) -> Any:
+    """:return: the node on which a run is training; None: it trains on none of them"""
+    for process in psutil.process_iter(["cmdline"]):
+        if "train" in (command := process.info["cmdline"] or []) and any(spec.name in part for part in command):
+            with suppress(psutil.NoSuchProcess):
+                ancestors = {parent.pid for parent in process.parents()}
+                for node in nodes:
+                    if node.all_processes["raylet"][0].process.pid in ancestors:
+                        return node
+    return None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("shared", [None, False], ids=["shared folder", "object store"])
 def test_a_node_that_dies_loses_nothing(
@@ -182,10 +195,14 @@ def test_a_node_that_dies_loses_nothing(
     stopped = threading.Event()
 
     def kill_one() -> None:
+        """Kill a node in the middle of a run that has a checkpoint."""
         while not stopped.wait(0.1):
-            if len({path.parents[2] for path in tmp_path.rglob("checkpoints/0*/manifest.json")}) >= 2:
-                cluster.remove_node(nodes[0], allow_graceful=False)
-                return
+            for spec in runs:
+                begun = any((tmp_path / spec.name).rglob("checkpoints/0*/manifest.json"))
+                node = node_of(spec, nodes) if begun and not finished(tmp_path / spec.name) else None
+                if node is not None:
+                    cluster.remove_node(node, allow_graceful=False)
+                    return
 
     killer = threading.Thread(target=kill_one)
     killer.start()
@@ -194,7 +211,7 @@ def test_a_node_that_dies_loses_nothing(
         failed = run_on_ray(
             runs,
             tmp_path,
-            RayOptions(cluster.address, gpus=0.5, memory=10**8, shared=shared),
+            RayOptions(cluster.address, gpus=0.5, memory=10**8, shared=shared, keep_every=0.1),
             checkpoint_every=25,
             report=report,
         )

@@ -18,6 +18,7 @@ from typing import Any, TextIO
 import yaml
 from filelock import FileLock, Timeout
 
+from sb3_crc.envs.rendering import FIRST_FRAME, NO_FRAME
 from sb3_crc.envs.tasks import environment_id
 from sb3_crc.experiments.runs import FAILURE, FINAL, SPEC, read_json, write_json
 from sb3_crc.experiments.specs import RunSpec
@@ -26,6 +27,8 @@ LOG, SETTINGS, LOCK = "log.txt", "settings.yml", "lock"
 CHECKPOINTS, FLAGS, DONE = "checkpoints", "flags.json", "DONE"
 #: Seconds in which a training that was told to stop saves a checkpoint
 PATIENCE = 60.0
+#: Seconds in which a back end that was chosen for a run must draw
+FIRST_FRAME_WITHIN = 60.0
 #: prctl(2)
 PR_SET_PDEATHSIG = 1
 
@@ -79,15 +82,27 @@ class RunProcess:
     :param checkpoint_every: agent steps between two checkpoints
     :param threads: of torch
     :param report: is told what happens
+    :param backends: OpenGL back ends to try, one after the other, where no first frame comes; none: the process chooses
     """
 
-    def __init__(self, spec: RunSpec, root: Path, *, checkpoint_every: int, threads: int, report: Report = lambda *_: None):
+    def __init__(
+        self,
+        spec: RunSpec,
+        root: Path,
+        *,
+        checkpoint_every: int,
+        threads: int,
+        report: Report = lambda *_: None,
+        backends: Sequence[str] = (),
+    ):
         self.spec = spec
+        self.backends = list(backends)
         self.folder = root / spec.name
         self.checkpoint_every = checkpoint_every
         self.report = report
         #: Exit code of the last process; negative: the signal that killed it
         self.exit_code: int | None = None
+        self._log_begin = 0
         self._environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
         self._process: subprocess.Popen[bytes] | None = None
         self._log: TextIO | None = None
@@ -135,6 +150,11 @@ class RunProcess:
         if self.exit_code is None:
             return True
         self._close_log()
+        if self.exit_code != 0 and self._no_frame_came():
+            tried = self.backends.pop(0)
+            self.report(self.spec, "restarted", f"no frame came from {tried}; now {self.backends[0]} draws")
+            self._begin()
+            return True
         run = self._run_folder()
         if self.exit_code == 0 and self._trains and run is not None:
             self._launch(self._evaluation(run), trains=False)
@@ -164,6 +184,12 @@ class RunProcess:
         self._close_log()
         self._lock.release()
 
+    def _no_frame_came(self) -> bool:
+        """:return: whether the process ended for that, and there is another back end"""
+        with (self.folder / LOG).open("rb") as log:
+            log.seek(self._log_begin)
+            return len(self.backends) > 1 and NO_FRAME.encode() in log.read()
+
     def _run_folder(self) -> Path | None:
         return next(iter(sorted(self.folder.glob("*/*_1"))), None)
 
@@ -179,6 +205,9 @@ class RunProcess:
 
     def _launch(self, command: list[str], *, trains: bool) -> None:
         self._log = (self.folder / LOG).open("a", encoding="utf-8")
+        self._log_begin = self._log.seek(0, os.SEEK_END)
+        if self.backends:
+            self._environment |= {"MUJOCO_GL": self.backends[0], FIRST_FRAME: str(FIRST_FRAME_WITHIN)}
         # in a session of its own: Ctrl-C reaches it through this process alone, once
         self._process = subprocess.Popen(
             command,

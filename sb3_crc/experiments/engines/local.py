@@ -21,7 +21,13 @@ class Stopped(KeyboardInterrupt):
 
 
 def run_locally(
-    specs: Sequence[RunSpec], root: Path, *, jobs: int = 1, checkpoint_every: int = 1_000, report: Report = lambda *_: None
+    specs: Sequence[RunSpec],
+    root: Path,
+    *,
+    jobs: int = 1,
+    checkpoint_every: int = 1_000,
+    report: Report = lambda *_: None,
+    renderers: int | None = None,
 ) -> list[RunSpec]:
     """
     Train and evaluate what is not finished yet. A run that fails leaves ``failure.json`` and does not stop the others; one
@@ -32,6 +38,8 @@ def run_locally(
     :param jobs: how many at once; each has its share of the cores
     :param checkpoint_every: agent steps between two checkpoints of a run
     :param report: is told what happens
+    :param renderers: how many may draw on the GPU at the same time, if each is to be watched; the others draw with OSMesa,
+        and so does one whose first frame does not come. None: each chooses for itself
     :return: the runs that failed
     :raises Stopped: on SIGINT or SIGTERM, once every run has saved
     """
@@ -42,9 +50,12 @@ def run_locally(
         try:
             while (waiting or running) and not caught:
                 while waiting and len(running) < jobs:
-                    run = RunProcess(
-                        waiting.pop(0), root, checkpoint_every=checkpoint_every, threads=threads_each(jobs), report=report
-                    )
+                    backends: list[str] = []
+                    if renderers is not None:
+                        on_gpu = sum(run.backends[0] == "egl" for run in running)
+                        backends = ["egl", "osmesa"] if on_gpu < renderers else ["osmesa"]
+                    own: dict[str, Any] = {"threads": threads_each(jobs), "report": report, "backends": backends}
+                    run = RunProcess(waiting.pop(0), root, checkpoint_every=checkpoint_every, **own)
                     try:
                         run.start()
                     except InUse as error:

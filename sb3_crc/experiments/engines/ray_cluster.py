@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_crc.experiments.engines.execution import Report, RunProcess, finished, plan, prepare
-from sb3_crc.experiments.engines.keeping import Keeper, working_copy
+from sb3_crc.experiments.engines.keeping import EVERY, Keeper, working_copy
 from sb3_crc.experiments.engines.local import Stopped, caught_signals
 from sb3_crc.experiments.specs import RunSpec
 
@@ -38,6 +38,7 @@ class RayOptions:
     :param memory: bytes that a run is given, so that not too many share a node; None: Ray does not count it
     :param retries: how often a run may die with its worker or node before it counts as failed
     :param shared: whether the nodes see the comparison's folder; None: each looks for itself
+    :param keep_every: where they do not: seconds between two looks at what a run has written
     """
 
     address: str | None = None
@@ -46,6 +47,7 @@ class RayOptions:
     memory: int | None = None
     retries: int = 5
     shared: bool | None = None
+    keep_every: float = EVERY
 
 
 def run_on_ray(
@@ -89,8 +91,8 @@ def run_on_ray(
             max_retries=options.retries,
             retry_exceptions=[Killed],
         )
-        job = {"mark": str(mark), "shared": options.shared, "keeper": keeper, "threads": options.cpus}
-        job |= {"checkpoint_every": checkpoint_every, "workplace": os.getcwd()}
+        job = {"mark": str(mark), "shared": options.shared, "keeper": keeper, "keep_every": options.keep_every}
+        job |= {"threads": options.cpus, "checkpoint_every": checkpoint_every, "workplace": os.getcwd()}
         with caught_signals() as caught:
             pending = {task.remote(spec, **job): spec for spec in waiting}
             for spec in waiting:
@@ -150,7 +152,15 @@ def _collect(spec: RunSpec, reference: Any, report: Report) -> bool:
 
 
 def _run_on_node(
-    spec: RunSpec, *, mark: str, shared: bool | None, keeper: Any, threads: int, checkpoint_every: int, workplace: str
+    spec: RunSpec,
+    *,
+    mark: str,
+    shared: bool | None,
+    keeper: Any,
+    keep_every: float,
+    threads: int,
+    checkpoint_every: int,
+    workplace: str,
 ) -> list[tuple[str, str]]:
     """:return: what happened to a run: events and remarks; executed by a worker"""
     if os.path.isdir(workplace):
@@ -158,7 +168,7 @@ def _run_on_node(
     root = Path(mark).parent
     if Path(mark).exists() if shared is None else shared:
         return _run_in(root, spec, threads, checkpoint_every)
-    with working_copy(spec.name, keeper) as own_root:
+    with working_copy(spec.name, keeper, every=keep_every) as own_root:
         return _run_in(own_root, spec, threads, checkpoint_every)
 
 

@@ -1,0 +1,114 @@
+"""One update on a GPU beside one of stock SB3 SAC on the same GPU, and what the memory of each is."""
+
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch as th
+
+from benchmarks.flops import operations
+from benchmarks.interleave import Work, in_fresh_process, interleave
+from benchmarks.networks import NETWORKS
+from benchmarks.peers import stock_sac
+from benchmarks.report import Target, judged, spread
+
+METHODS = ("crc", "crc_release", "curl", "rad", "drq")
+#: Name -> how updates are made
+FORMS: dict[str, dict[str, Any]] = {
+    "float32": {},
+    "float32, recorded": {"compile": True},
+    "bfloat16": {"precision": "bfloat16"},
+    "bfloat16, recorded": {"precision": "bfloat16", "compile": True},
+}
+STOCK, LAYOUT = "SB3 SAC", "SB3 SAC, channels_last"
+#: Of the paper's networks with batch 512
+TARGETS = {("crc", "bfloat16, recorded"): [Target("ms", 6)]}
+#: Updates per turn, the actor's and the targets' among them, so that what the host does besides is a small part
+UPDATES = 20
+
+
+def measure(
+    networks: str,
+    batch_size: int,
+    *,
+    repeats: int,
+    methods: tuple[str, ...] = METHODS,
+    forms: tuple[str, ...] = tuple(FORMS),
+    on_round: Callable[[int], object] = lambda done: None,
+) -> list[dict[str, Any]]:
+    """
+    :param networks: in :data:`~benchmarks.networks.NETWORKS`
+    :param batch_size: B
+    :param repeats: rounds, in each of which every method is timed once
+    :param methods: presets
+    :param forms: of :data:`FORMS`
+    :param on_round: told how many rounds are done
+    :return: a row per method and form, and per peer
+    """
+    setting = networks, batch_size
+    programs: dict[tuple[str, str], Callable[[], Work]] = {
+        (method, form): partial(ours, method, form, *setting) for method in methods for form in forms
+    }
+    programs[STOCK, "float32"] = partial(stock, *setting, channels_last=False)
+    programs[LAYOUT, "float32"] = partial(stock, *setting, channels_last=True)
+    named = {" ".join(name): program for name, program in programs.items()}
+    seconds = interleave(named, repeats=repeats, on_round=on_round)
+    peak = in_fresh_process(partial(matrix_peak, th.bfloat16))
+    rows = []
+    for (method, form), program in programs.items():
+        name = f"{method} {form}"
+        per_update = [value / UPDATES for value in seconds[name]]
+        row: dict[str, Any] = {"networks": networks, "batch": batch_size, "method": method, "form": form} | spread(per_update)
+        for column, peer in (("/ stock", STOCK), ("/ channels_last", LAYOUT)):
+            row[column] = statistics.median(a / b for a, b in zip(seconds[name], seconds[f"{peer} float32"], strict=True))
+        gigabytes, needed = in_fresh_process(partial(memory_and_operations, program))
+        row["GB"] = gigabytes
+        if method in methods:
+            row |= {"needed GFLOP": needed / 1e9, "bf16 peak %": 100 * needed / statistics.median(per_update) / peak}
+        targets = TARGETS.get((method, form), []) if setting == ("paper", 512) else []
+        rows.append(judged(row, targets))
+    return rows
+
+
+def ours(method: str, form: str, networks: str, batch_size: int, device: str = "cuda") -> Work:
+    """:return: :data:`UPDATES` updates of CRCSAC, with cuDNN's fastest algorithms as within :meth:`learn`"""
+    model = NETWORKS[networks].crc_sac(method, batch_size, device=device, **FORMS[form])
+    th.backends.cudnn.deterministic, th.backends.cudnn.benchmark = False, True
+    return lambda: finish(model.train(UPDATES, batch_size))
+
+
+def stock(networks: str, batch_size: int, *, channels_last: bool, device: str = "cuda") -> Work:
+    """:return: as many of SB3's SAC, with the same settings of cuDNN"""
+    model = stock_sac(NETWORKS[networks], batch_size, channels_last=channels_last, device=device)
+    th.backends.cudnn.deterministic, th.backends.cudnn.benchmark = False, True
+    return lambda: finish(model.train(UPDATES, batch_size))
+
+
+def finish(result: object) -> object:
+    """Wait until the GPU has done what was asked of it. :return: ``result``"""
+    if th.cuda.is_available():
+        th.cuda.synchronize()
+    return result
+
+
+def memory_and_operations(program: Callable[[], Work]) -> tuple[float, float]:
+    """:return: gigabytes that torch took for the program, and operations of one update that is launched piece by piece"""
+    work = program()
+    work()
+    gigabytes = th.cuda.max_memory_reserved() / 1e9 if th.cuda.is_available() else 0.0
+    return gigabytes, operations(work) / UPDATES
+
+
+def matrix_peak(dtype: th.dtype, size: int = 8192, repeats: int = 20) -> float:
+    """:return: operations per second of a product of square matrices"""
+    device = "cuda" if th.cuda.is_available() else "cpu"
+    left, right = (th.randn(size, size, device=device).to(dtype) for _ in range(2))
+    seconds = []
+    for _ in range(repeats):
+        finish(None)
+        start = time.perf_counter()
+        finish(left @ right)
+        seconds.append(time.perf_counter() - start)
+    return 2 * size**3 / statistics.median(seconds[1:])
