@@ -1,0 +1,31 @@
+"""The GPU's benchmark as far as a CPU can show it: the work that it times, and what it says without a GPU."""
+
+from functools import partial
+
+import pytest
+import torch as th
+from typer.testing import CliRunner
+
+from benchmarks.__main__ import app
+from benchmarks.gpu import FORMS, UPDATES, matrix_peak, memory_and_operations, ours, stock
+from benchmarks.update import count
+from benchmarks.update import ours as on_cpu
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_all_forms_need_the_same_operations(form: str) -> None:
+    _, needed = memory_and_operations(partial(ours, "rad", form, "laptop", 8, device="cpu"))
+    assert needed == pytest.approx(count(partial(on_cpu, "rad", "laptop", 8, 2)) / 2, rel=1e-6)
+
+
+def test_stock_is_timed_over_as_many_updates() -> None:
+    model = partial(stock, "laptop", 8, channels_last=True, device="cpu")
+    _, needed = memory_and_operations(model)
+    assert needed > 0 and UPDATES % 2 == 0
+    assert matrix_peak(th.float32, size=64, repeats=3) > 0
+
+
+def test_without_a_gpu_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.cuda, "is_available", lambda: False)
+    done = CliRunner().invoke(app, ["gpu"])
+    assert done.exit_code == 2 and "there is no GPU that torch can use" in " ".join(done.stderr.split())
