@@ -4,6 +4,7 @@ import io
 import os
 import pathlib
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -12,8 +13,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.sac import SAC
 from typing_extensions import Self
 
@@ -22,14 +24,19 @@ from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
 from sb3_crc.convolutions import fastest_convolutions
 from sb3_crc.finite import LossHistory
-from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm, Speedometer
+from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm, Speedometer, watched
 from sb3_crc.memory import memory_kept
+from sb3_crc.overlap import EarlyUpdates
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
-from sb3_crc.recording import RecordedUpdates, unprepare
+from sb3_crc.recording import RecordedUpdates, recorded_updates, unprepare
 from sb3_crc.saved_model import add_plain_attributes, check_pickles, check_saved_model, read_saved_attributes
 from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
 from sb3_crc.stacking import stacked_frame_channels
+from sb3_crc.views import Views
+
+#: Metrics that must stay finite, beside the objectives
+LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")
 
 
 class BaseCRCSAC(SAC):
@@ -44,6 +51,13 @@ class BaseCRCSAC(SAC):
     encoder_learning_rate: LearningRate | None
     ent_coef_learning_rate: LearningRate | None
     replay_device: str
+    overlap: bool
+    compile: bool
+    policy_delay: int
+    auxiliary_interval: int
+    _objective_weights: dict[str, float]
+    _weight_tensors: dict[str, th.Tensor]
+    _early_updates: EarlyUpdates
     _env_steps: int | None = None
     _frame_channels: int | None = None
     _speedometer: Speedometer
@@ -56,6 +70,7 @@ class BaseCRCSAC(SAC):
     def _setup_model(self) -> None:
         self._speedometer = Speedometer()
         self._collapse_alarm = CollapseAlarm()
+        self._early_updates = EarlyUpdates(self)
         own = {name: getattr(self, name) for name in ("replay_buffer_class", "replay_buffer_kwargs", "n_steps")}
         self._choose_replay_buffer()
         super()._setup_model()
@@ -112,12 +127,15 @@ class BaseCRCSAC(SAC):
         }
         return {name: optimizer for name, optimizer in optimizers.items() if optimizer is not None}
 
-    def _update_learning_rates(self) -> None:
+    def _begin_updates(self) -> LossHistory:
+        """:return: of what was made already, or of what is to come"""
+        self.policy.set_training_mode(True)
         for name, optimizer in self._optimizers().items():
             value = self._lr_schedules[name](self._current_progress_remaining)
             check_learning_rate(name, value)
             set_learning_rate(optimizer, value)
-            self.logger.record(f"train/{name}", value)
+        losses = {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)}
+        return self._early_updates.taken() or LossHistory(self._n_updates + 1, losses)
 
     def _check_stored(self, batch_size: int) -> None:
         """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
@@ -136,6 +154,8 @@ class BaseCRCSAC(SAC):
             assert self.replay_buffer is not None
             normalize, folder = self._vec_normalize_env, self.logger.dir
             history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
+        for name in self._optimizers():
+            self.logger.record(f"train/{name}", self._lr_schedules[name](self._current_progress_remaining))
         for name, mean in means.items():
             self.logger.record(name, mean)
         if "representation/latent_std" in means:
@@ -262,6 +282,45 @@ class BaseCRCSAC(SAC):
         check_pickles(path, saved, custom_objects, safe=safe)
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
+    # -- Other ways to make an update --------------------------------------------------------------------------------
+
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As in SB3; with ``overlap``, updates are made during the steps."""
+        rollout = super().collect_rollouts(self._early_updates.around(env) if self.overlap else env, *args, **kwargs)
+        if not rollout.continue_training:
+            self._early_updates.taken()
+        return rollout
+
+    def _set_up_recording(self) -> None:
+        optimizers = self._optimizers().values()
+        self._recorded = recorded_updates(self._update, optimizers, self.device) if self.compile else None
+        recorded_weights = self._objective_weights if self._recorded else ()
+        self._weight_tensors = {name: th.zeros((), device=self.device) for name in recorded_weights}
+
+    def _make_update(self, history: LossHistory, batch_size: int) -> None:
+        raise NotImplementedError
+
+    def _update(self, views: Views) -> dict[str, th.Tensor]:
+        raise NotImplementedError
+
+    def _replayed(self, views: Views) -> dict[str, th.Tensor]:
+        """:meth:`_update` by a recording, but where instruments look at it, which wait for the device."""
+        assert self._recorded is not None
+        for name, weight in self._objective_weights.items():
+            self._weight_tensors[name].fill_(weight)
+        if self._n_updates % HEALTH_INTERVAL == 0:
+            return self._update(views)
+        intervals = self.policy_delay, self.target_update_interval, self.auxiliary_interval
+        return self._recorded(views, tuple(self._n_updates % interval == 0 for interval in intervals))
+
+    def _instruments(self, views: Views) -> AbstractContextManager[dict[str, th.Tensor]]:
+        if self._n_updates % HEALTH_INTERVAL != 0:
+            return nullcontext({})
+        parts = {"encoder": list(self.critic.features_extractor.parameters()), "q_heads": self.critic.head_parameters()}
+        return watched(lambda: views.anchor.leaves, parts)
+
+    # -- Saving ------------------------------------------------------------------------------------------------------
+
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """As in SB3."""
         super().set_parameters(*args, **kwargs)
@@ -285,6 +344,7 @@ class BaseCRCSAC(SAC):
             "_reads_next",
             "_recorded",
             "_weight_tensors",
+            "_early_updates",
             "between_updates",
         ]
 

@@ -4,7 +4,6 @@ B batch, Z latent, A action.
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch as th
@@ -17,11 +16,9 @@ from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory
 from sb3_crc.image_spaces import image_shape, image_space
-from sb3_crc.instruments import HEALTH_INTERVAL, watched
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
-from sb3_crc.recording import recorded_updates
 from sb3_crc.representation import AuxiliaryGradients, auxiliary_gradients
 from sb3_crc.schedules import LearningRate
 from sb3_crc.settings import check_name, check_ranges
@@ -29,8 +26,6 @@ from sb3_crc.views import View, Views
 
 #: Side of the network's input over that of the frame, where crops are cut: 84 of 100 pixels (RAD, CURL, CRC-RL).
 CROP_RATIO = 0.84
-#: Metrics that must stay finite, beside the objectives
-LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")
 
 #: Argument -> what it may be
 CHOICES = {
@@ -90,6 +85,8 @@ class CRCSAC(BaseCRCSAC):
     :param compile: on a GPU, record the work of an update once and replay it (:mod:`~sb3_crc.recording`); on a CPU, nothing
     :param replay_device: where frames are kept: ``"auto"``: beside the networks if they fit there, else in the host's memory;
         ``"model"``: beside the networks; ``"cpu"``
+    :param overlap: make the update that follows a step while the environments step (:mod:`~sb3_crc.overlap`), with the same
+        results; callbacks see the networks of after it within a step. For SubprocVecEnv, with a GPU or an idle core
     :raises ValueError: for observations or settings that cannot work, naming the value and what is allowed
     """
 
@@ -129,6 +126,7 @@ class CRCSAC(BaseCRCSAC):
         precision: str = "float32",
         compile: bool = False,
         replay_device: str = "auto",
+        overlap: bool = False,
         policy_kwargs: dict[str, Any] | None = None,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -174,6 +172,7 @@ class CRCSAC(BaseCRCSAC):
         self.precision = precision
         self.compile = compile
         self.replay_device = replay_device
+        self.overlap = overlap
         if _init_setup_model:
             self._setup_model()
 
@@ -215,9 +214,7 @@ class CRCSAC(BaseCRCSAC):
         self._augment_query = None if own is None else augmented_input(own, self.objective_augmentation_kwargs, shape, size)
         if self.log_ent_coef is not None:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], betas=(0.5, 0.999), fused=True)  # CURL's
-        self._recorded = recorded_updates(self._update, self._optimizers().values(), self.device) if self.compile else None
-        recorded_weights = self._objective_weights if self._recorded else ()
-        self._weight_tensors = {name: th.zeros((), device=self.device) for name in recorded_weights}
+        self._set_up_recording()
 
     def _network_input(self) -> ImageSize:
         if self.image_size is not None:
@@ -236,22 +233,22 @@ class CRCSAC(BaseCRCSAC):
         :param batch_size: transitions per update
         """
         self._check_stored(batch_size)
-        self.policy.set_training_mode(True)
-        self._update_learning_rates()
         if self._n_updates == 0:
             gradient_steps += self.initial_updates
-
-        history = LossHistory(self._n_updates + 1, {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)})
-        for _ in range(gradient_steps):
-            self.between_updates()
-            self._n_updates += 1
-            metrics = history.begin()
-            views = self._sample_views(batch_size)
-            metrics |= self._replayed(views) if self._recorded is not None else self._update(views)
+        history = self._begin_updates()
+        for _ in range(gradient_steps - len(history.updates)):
+            self._make_update(history, batch_size)
         self._record(history, batch_size)
 
-    def _update(self, views: Views) -> dict[str, th.Tensor]:
+    def _make_update(self, history: LossHistory, batch_size: int) -> None:
         """One update by one batch."""
+        self.between_updates()
+        self._n_updates += 1
+        metrics = history.begin()
+        views = self._sample_views(batch_size)
+        metrics |= self._update(views) if self._recorded is None else self._replayed(views)
+
+    def _update(self, views: Views) -> dict[str, th.Tensor]:
         with self._instruments(views) as health:
             metrics = self._update_critic_and_encoder(views)
         metrics |= health
@@ -260,16 +257,6 @@ class CRCSAC(BaseCRCSAC):
         if self._n_updates % self.target_update_interval == 0:
             self._update_targets()
         return metrics
-
-    def _replayed(self, views: Views) -> dict[str, th.Tensor]:
-        """:meth:`_update` by a recording, but where instruments look at it, which wait for the device."""
-        assert self._recorded is not None
-        for name, weight in self._objective_weights.items():
-            self._weight_tensors[name].fill_(weight)
-        if self._n_updates % HEALTH_INTERVAL == 0:
-            return self._update(views)
-        intervals = self.policy_delay, self.target_update_interval, self.auxiliary_interval
-        return self._recorded(views, tuple(self._n_updates % interval == 0 for interval in intervals))
 
     def _sample_views(self, batch_size: int) -> Views:
         assert self.replay_buffer is not None
@@ -385,14 +372,6 @@ class CRCSAC(BaseCRCSAC):
             th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         optimizer.step()
         optimizer.zero_grad()
-
-    # -- Around it -----------------------------------------------------------------------------------------------------
-
-    def _instruments(self, views: Views) -> AbstractContextManager[dict[str, th.Tensor]]:
-        if self._n_updates % HEALTH_INTERVAL != 0:
-            return nullcontext({})
-        parts = {"encoder": list(self.critic.features_extractor.parameters()), "q_heads": self.critic.head_parameters()}
-        return watched(lambda: views.anchor.leaves, parts)
 
 
 def _parameters(optimizer: th.optim.Optimizer) -> list[th.Tensor]:

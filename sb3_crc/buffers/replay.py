@@ -3,7 +3,8 @@
 B batch, k frames in a stack, C channels of a frame, H, W height and width, A action, N ``n_envs``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,6 +100,7 @@ class FrameReplayBuffer(PlacedReplayBuffer):
         self.latest = [Latest()] * n_envs
         #: Files of :mod:`~sb3_crc.buffers.files` that hold frames of this buffer
         self.segments: tuple[Any, ...] = ()
+        self._ahead = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_warned": False}
@@ -268,8 +270,32 @@ class FrameReplayBuffer(PlacedReplayBuffer):
         :param batch_size: B
         :param env: normalises rewards
         """
-        rows = np.random.randint(0, self.size(), size=batch_size)
+        rows = np.random.randint(0, self._rows_to_sample(), size=batch_size)
         return self._frame_samples(rows, env)
+
+    @contextmanager
+    def one_ahead(self) -> Iterator[None]:
+        """Within it batches are drawn as if the next transition of each environment were stored already."""
+        self._ahead = 1
+        try:
+            yield
+        finally:
+            self._ahead = 0
+
+    def next_batch_is_there(self, batch_size: int) -> bool:
+        """
+        Look ahead; the batch can still be drawn.
+
+        :param batch_size: B
+        :return: whether no return of it reaches a row that is to be written
+        """
+        state = np.random.get_state()
+        rows = np.random.randint(0, self._rows_to_sample(), size=batch_size)
+        np.random.set_state(state)
+        return self._ahead == 0 or bool(((self.pos - rows) % self.buffer_size >= self.n_steps).all())
+
+    def _rows_to_sample(self) -> int:
+        return min(self.size() + self._ahead, self.buffer_size)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         return self._frame_samples(batch_inds, env).whole()

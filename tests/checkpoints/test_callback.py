@@ -62,9 +62,16 @@ def cartpole(seed: int) -> gym.Env[Any, Any]:
 
 
 def train(
-    folder: Path, *, seed: int = 0, stop: int | None = None, steps: int = STEPS, make_env: Any = cartpole, **own: Any
+    folder: Path,
+    *,
+    seed: int = 0,
+    stop: int | None = None,
+    steps: int = STEPS,
+    make_env: Any = cartpole,
+    overlap: bool = False,
+    **own: Any,
 ) -> CRCSAC:
-    model = CRCSAC("CnnPolicy", make_env(seed), seed=seed, **SETTINGS)
+    model = CRCSAC("CnnPolicy", make_env(seed), seed=seed, overlap=overlap, **SETTINGS)
     checkpoint = TrainingCheckpoint(folder, **{"every": 10, **own})
     try:
         model.learn(steps, callback=[checkpoint, Stop(stop)])
@@ -94,6 +101,12 @@ def test_stopped_and_run_again_it_ends_the_same(stops: tuple[int, ...], whole: C
         assert not (tmp_path / DONE).exists()
     assert_equal(train(tmp_path, seed=9), whole)
     assert (tmp_path / DONE).read_text() == "60\n"
+
+
+def test_updates_made_during_steps_go_on_too(whole: CRCSAC, tmp_path: Path) -> None:
+    for number, stop in enumerate((25, 47)):
+        train(tmp_path, seed=number, stop=stop, overlap=True)
+    assert_equal(train(tmp_path, seed=9, overlap=True), whole)
 
 
 class Signal(BaseCallback):
