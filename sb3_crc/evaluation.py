@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
+from sb3_crc.disk import outlived
 
 Observation = np.ndarray | dict[str, np.ndarray]
 
@@ -87,12 +88,12 @@ class QBiasEvalCallback(EvalCallback):
         self._biases = []
         self._episodes = {}
         if self.log_path is None:
-            return super()._on_step()
+            return self._evaluate_and_save()
         done = len(self.evaluations_length)
         # SB3's own writing, which Ctrl-C may cut short, goes nowhere; what is evaluated by then is written whole
         log_path, self.log_path = self.log_path, io.BytesIO()  # type: ignore[assignment]
         try:
-            return super()._on_step()
+            return self._evaluate_and_save()
         finally:
             self.log_path = log_path
             if len(self.evaluations_length) > done:
@@ -100,6 +101,11 @@ class QBiasEvalCallback(EvalCallback):
                 self.evaluations_updates.append(getattr(self.model, "_n_updates", 0))
                 self.evaluations_seconds.append(self._trained)
             self._write_evaluations()
+
+    def _evaluate_and_save(self) -> bool:
+        with outlived(f"the best model in {self.best_model_save_path}"):
+            return super()._on_step()
+        return True
 
     def _write_evaluations(self) -> None:
         records: dict[str, list[Any]] = {
@@ -115,8 +121,9 @@ class QBiasEvalCallback(EvalCallback):
             if len(values := getattr(self, f"evaluations_{name}")) == complete:  # not if an older checkpoint knew of none
                 arrays[name] = np.array(values)
         arrays["training_seconds"] = np.array(self._trained)
+        path = Path(f"{self.log_path}.npz")
         if complete > 0:
-            with atomic_write(Path(f"{self.log_path}.npz")) as unfinished, unfinished.open("wb") as file:
+            with outlived(path), atomic_write(path) as unfinished, unfinished.open("wb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from filelock import FileLock, Timeout
@@ -16,11 +17,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.buffers.files import contents, read_contents
-from sb3_crc.checkpoints.logs import distant_monitors, set_distant_monitors
+from sb3_crc.checkpoints.logs import distant_monitors, endure, set_distant_monitors
 from sb3_crc.checkpoints.signals import StopRequest, TrainingStopped
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
 from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
 from sb3_crc.checkpoints.tree import Tree
+from sb3_crc.disk import outlived
 
 LOCK, OWNER, DONE = "lock", "owner.json", "DONE"
 
@@ -35,6 +37,9 @@ class TrainingCheckpoint(BaseCallback):
     SIGTERM are such a point too: a checkpoint is saved, and :class:`~sb3_crc.checkpoints.signals.TrainingStopped`, a
     KeyboardInterrupt, is raised. Where none comes within 5 seconds, training stops between two updates or steps, and the last
     checkpoint is the one to go on from. A second signal ends the process at once.
+
+    A disk that is full, read-only or failing does not end the training: each checkpoint that cannot be written is told of at
+    once, and all of them at the end, with the last one that is whole. The log's and Monitor's files get what fits.
 
     :param folder: of the checkpoints of this run
     :param every: agent steps between two checkpoints, rounded up to the next start of a rollout
@@ -66,6 +71,10 @@ class TrainingCheckpoint(BaseCallback):
         self._lock = FileLock(Path(folder) / LOCK)
         self._writer: ThreadPoolExecutor | None = None
         self._writing: Future[Path] | None = None
+        self._whole: Path | None = None
+        self._segments: tuple[Any, ...] = ()
+        self._failures = 0
+        self._saved_whole = True
         self._request = StopRequest()
 
     @property
@@ -84,6 +93,8 @@ class TrainingCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._writer = ThreadPoolExecutor(1, "checkpoint")
+        self._failures = 0
+        endure(self.logger, self.training_env)
         self._request = StopRequest()
         self._request.listen()
         if hasattr(self.model, "between_updates"):  # an attribute that a stock algorithm does not know would be saved with it
@@ -101,6 +112,7 @@ class TrainingCheckpoint(BaseCallback):
         buffer = self.model.replay_buffer
         assert isinstance(buffer, FrameReplayBuffer)
         read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
+        self._whole = checkpoint.path
         set_training_state(self.model, self.locals["callback"], checkpoint.state)
         self._saved_at = self.num_timesteps = self.model.num_timesteps
         for one in callback_tree(self.locals["callback"]):
@@ -131,9 +143,13 @@ class TrainingCheckpoint(BaseCallback):
             return
         if self.model.num_timesteps > self._saved_at:
             self._save()
-        self._finish_writing()
-        if self.model.num_timesteps >= self.model._total_timesteps:
-            with atomic_write(self.store.folder / DONE) as unfinished:
+        at_end = self._finish_writing()
+        if self._failures > 0:
+            last = f"the last whole one is {self._whole}" if self._whole else "there is no whole one"
+            number = f"{self._failures} checkpoint{'s' * (self._failures > 1)}"
+            warnings.warn(f"{number} of this training could not be written; {last}", stacklevel=2)
+        if at_end and self.model.num_timesteps >= self.model._total_timesteps:
+            with outlived(self.store.folder / DONE), atomic_write(self.store.folder / DONE) as unfinished:
                 unfinished.write_text(f"{self.model.num_timesteps}\n", encoding="utf-8")
         self.close()
 
@@ -164,17 +180,39 @@ class TrainingCheckpoint(BaseCallback):
         buffer, steps = self.model.replay_buffer, self.model.num_timesteps
         assert isinstance(buffer, FrameReplayBuffer)
         assert self._writer is not None
-        self._saved_at = steps
+        self._saved_at, self._segments = steps, buffer.segments
         replay = contents(buffer, self.store.segments, buffer.segments)
         state = training_state(self.model, self.locals["callback"])
         buffer.segments = replay.segments
         self._writing = self._writer.submit(self.store.save, steps, state, replay)
 
-    def _finish_writing(self) -> None:
-        """:raises OSError: if the last checkpoint could not be written"""
+    def _finish_writing(self) -> bool:
+        """
+        Wait for the last checkpoint. One that could not be written is told of; its frames are written with the next one.
+
+        :return: whether it is whole
+        """
         writing, self._writing = self._writing, None
-        if writing is not None:
-            writing.result()
+        if writing is None:
+            return self._saved_whole
+        try:
+            self._whole = writing.result()
+        except OSError as error:
+            self._failures += 1
+            buffer = self.model.replay_buffer
+            assert isinstance(buffer, FrameReplayBuffer)
+            buffer.segments = self._segments
+            self.store.remove_unfinished()
+            before = f"{self._whole} is whole" if self._whole else "there is none before it"
+            warnings.warn(
+                f"the checkpoint of {self._saved_at} agent steps could not be written: {error}. Training goes on, {before}, "
+                f"and the next one is due {self.every} steps later",
+                stacklevel=2,
+            )
+            self._saved_whole = False
+        else:
+            self._saved_whole = True
+        return self._saved_whole
 
     def _take_lock(self) -> None:
         self.store.folder.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,10 @@
 """Files that SB3 opens anew when a script starts: what a stopped run had written is written again, and then continued."""
 
+import sys
 import time
 from collections.abc import Iterator
 from csv import DictReader, DictWriter
+from csv import writer as csv_writer
 from io import StringIO
 from pathlib import Path
 from typing import Any, TextIO
@@ -13,6 +15,7 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
 from sb3_crc.checkpoints.tree import Tree, copied, is_plain
+from sb3_crc.disk import EnduringFile
 
 
 def log_state(logger: Logger, env: VecEnv) -> Tree:
@@ -51,6 +54,27 @@ def set_log_state(logger: Logger, env: VecEnv, state: Tree) -> None:
     for monitor, text, seconds in zip(_monitors(env), state["monitors"], state["seconds"], strict=False):
         _write(monitor.results_writer.file_handler, text)
         monitor.t_start = time.time() - seconds
+
+
+def endure(logger: Logger, env: VecEnv) -> None:
+    """
+    Let the log's files and Monitor's, of environments in this process, outlive a disk that fails. TensorBoard's do not.
+
+    :param logger: of the model
+    :param env: of the training
+    """
+    for format_ in logger.output_formats:
+        file = getattr(format_, "file", None)
+        if isinstance(getattr(file, "name", None), str) and file not in (sys.stdout, sys.stderr):
+            format_.file = _enduring(file)  # type: ignore[attr-defined]
+    for monitor in _monitors(env):
+        results = monitor.results_writer
+        results.file_handler = _enduring(results.file_handler)
+        results.logger.writer = csv_writer(results.file_handler)
+
+
+def _enduring(file: Any) -> EnduringFile:
+    return file if isinstance(file, EnduringFile) else EnduringFile(file)
 
 
 def distant_monitors(env: VecEnv, folder: Path | None) -> Tree:

@@ -139,6 +139,11 @@ class CheckpointStore:
             raise CheckpointError(f"all checkpoints in {self.folder} are damaged: remove that folder to start anew")
         return None
 
+    def remove_unfinished(self) -> None:
+        """Make room on a disk after a checkpoint could not be written; what cannot be removed stays."""
+        for path in [*self.folder.glob(f"{UNFINISHED}*")]:
+            shutil.rmtree(path, ignore_errors=True)
+
     def _read(self, path: Path) -> Checkpoint:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
         if manifest["format"] > FORMAT:
@@ -161,8 +166,7 @@ class CheckpointStore:
         needed = {name for checkpoint in kept for name in self._needed(checkpoint)}
         for name in superfluous:
             shutil.rmtree(self.folder / name)
-        for path in [*self.folder.glob(f"{UNFINISHED}*")]:
-            shutil.rmtree(path)
+        self.remove_unfinished()
         for path in self.segments.iterdir():
             if path.name not in needed:
                 path.unlink()

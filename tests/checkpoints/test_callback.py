@@ -1,6 +1,7 @@
 """A training that is stopped goes on to the end that it would have had, whatever stopped it."""
 
 import csv
+import errno
 import json
 import os
 import signal
@@ -377,10 +378,10 @@ class Full(OSError):
     "function", ["numpy.lib.format.write_array", "safetensors.torch.save_file", "numpy.savez", "os.replace"]
 )
 @pytest.mark.parametrize("call", [1, 3])
-def test_a_writer_that_fails_leaves_what_was_there(
+def test_a_training_outlives_a_disk_that_is_full(
     function: str, call: int, whole: CRCSAC, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full disk, at any file of any checkpoint: the training ends with the error, and the same script goes on."""
+    """At any file of any checkpoint: the user is told, the next checkpoint is whole, and the same script goes on from it."""
     from sb3_crc.checkpoints import tree
 
     calls = 0
@@ -402,12 +403,33 @@ def test_a_writer_that_fails_leaves_what_was_there(
             module, _, name = function.rpartition(".")
             target = {"numpy.lib.format": np.lib.format, "numpy": np, "os": os}[module]
             patch.setattr(target, name, failing(getattr(target, name)))
-        model = CRCSAC("CnnPolicy", cartpole(0), seed=0, **SETTINGS)
-        checkpoint = TrainingCheckpoint(tmp_path, every=10)
-        with pytest.raises(Full):
-            model.learn(STEPS, callback=[checkpoint, Stop(None)])
-        checkpoint.close()
+        with pytest.warns(UserWarning, match="could not be written") as told:
+            train(tmp_path, seed=0, stop=45)
+    assert sum("could not be written: no space left. Training goes on" in str(one.message) for one in told) == 1
+    assert CheckpointStore(tmp_path).names()[0] == "000000000040"
     assert_equal(train(tmp_path, seed=0), whole)
+
+
+def test_a_disk_that_stays_full_is_told_of_at_the_end(whole: CRCSAC, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(tmp_path, seed=0, stop=25)
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez", full)
+        with pytest.warns(UserWarning, match="could not be written") as told:
+            assert_equal(train(tmp_path, seed=1), whole)
+    messages = [str(one.message) for one in told]
+    assert (
+        messages[-1]
+        == f"4 checkpoints of this training could not be written; the last whole one is {tmp_path / '000000000020'}"
+    )
+    assert len([message for message in messages if "Training goes on, " in message]) == 4
+    assert not (tmp_path / DONE).exists() and not list(tmp_path.glob(".*unfinished*"))
+    assert CheckpointStore(tmp_path).names() == ["000000000020", "000000000010"]
+    assert_equal(train(tmp_path, seed=2), whole)  # there is room again
+    assert (tmp_path / DONE).exists()
+
+
+def full(*args: Any, **kwargs: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 SCRIPT = """

@@ -1,0 +1,148 @@
+"""Logs, episodes and evaluations outlive a disk that fails, and tell of it once."""
+
+import errno
+import io
+import os
+import shutil
+import subprocess
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_crc import CRCSAC
+from sb3_crc.checkpoints.callback import TrainingCheckpoint
+from sb3_crc.checkpoints.store import CheckpointStore
+from sb3_crc.disk import EnduringFile, outlived
+from sb3_crc.evaluation import QBiasEvalCallback
+from tests.conftest import POLICY_KWARGS, NoiseEnv
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+class Disk(io.StringIO):
+    """A file on a disk that can be full."""
+
+    name = "log.csv"
+    full = False
+
+    def flush(self) -> None:
+        if self.full:
+            raise FULL
+        super().flush()
+
+
+def test_a_file_tells_once_until_it_can_be_written_again() -> None:
+    disk = Disk()
+    file = EnduringFile(disk)
+    told = []
+    for full in (False, True, True, False, True):
+        disk.full = full
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            file.write("x")
+            file.flush()
+        told.append([str(one.message) for one in caught])
+    message = "log.csv could not be written: [Errno 28] No space left on device. Training goes on"
+    assert told == [[], [message], [], [], [message]]
+    disk.full = False
+    assert file.getvalue() == "xxxxx" and file.name == "log.csv"
+
+
+def test_errors_that_are_not_the_disks_are_raised() -> None:
+    with pytest.raises(BrokenPipeError), outlived("a file"):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+    disk = Disk()
+    disk.flush = lambda: (_ for _ in ()).throw(ConnectionResetError(errno.ECONNRESET, "reset"))  # type: ignore[method-assign]
+    with pytest.raises(ConnectionResetError):
+        EnduringFile(disk).flush()
+
+
+def model_in(folder: Path) -> CRCSAC:
+    env = DummyVecEnv([lambda: Monitor(NoiseEnv(), str(folder / "0.monitor.csv"))])
+    model = CRCSAC(
+        "CnnPolicy", env, batch_size=8, buffer_size=100, learning_starts=20, policy_kwargs=POLICY_KWARGS, seed=0, device="cpu"
+    )
+    model.set_logger(configure(str(folder), ["csv", "json", "log"]))
+    return model
+
+
+def callbacks(folder: Path) -> list[Any]:
+    evaluation = QBiasEvalCallback(
+        DummyVecEnv([lambda: Monitor(NoiseEnv())]),
+        log_path=str(folder),
+        best_model_save_path=str(folder),
+        n_eval_episodes=1,
+        eval_freq=20,
+        verbose=0,
+    )
+    return [evaluation, TrainingCheckpoint(folder / "checkpoints", every=20)]
+
+
+def test_files_of_a_training_are_the_same_as_ever(tmp_path: Path) -> None:
+    """What endures writes what was written before."""
+    plain, enduring = tmp_path / "plain", tmp_path / "enduring"
+    for folder in (plain, enduring):
+        folder.mkdir()
+        model = model_in(folder)
+        model.learn(60, callback=callbacks(folder)[: 1 if folder == plain else 2], log_interval=1)
+        model.logger.close()
+        model.get_env().close()  # type: ignore[union-attr]
+    for name in ("0.monitor.csv", "progress.csv"):
+        rows = [[cell for cell in line.split(",")] for line in (plain / name).read_text(encoding="utf-8").splitlines()]
+        own = [[cell for cell in line.split(",")] for line in (enduring / name).read_text(encoding="utf-8").splitlines()]
+        assert len(rows) == len(own) > 3 and [len(row) for row in rows] == [len(row) for row in own]
+    assert isinstance(model.logger.output_formats[0].file, EnduringFile)  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 8 MB; where none can be mounted, nothing can be shown."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], check=False, capture_output=True)
+    if mounted.returncode != 0:
+        pytest.skip("no tmpfs can be mounted")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.skipif(shutil.which("mount") is None or not hasattr(os, "geteuid"), reason="no mount")
+def test_a_training_on_a_full_disk_comes_to_its_end(small_disk: Path, tmp_path: Path) -> None:
+    (small_disk / "ballast").write_bytes(bytes(8_200_000))
+    model = model_in(small_disk)
+    with pytest.warns(UserWarning, match="Training goes on") as told:
+        model.learn(80, callback=callbacks(small_disk), log_interval=1)
+    assert model.num_timesteps == 80 and model._n_updates == 60
+    messages = " ".join(str(one.message) for one in told)
+    for what in ("the checkpoint of", "the best model in", "of this training could not be written"):
+        assert what in messages, messages
+    (small_disk / "ballast").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(40, callback=callbacks(small_disk)[1:], reset_num_timesteps=False)
+    assert CheckpointStore(small_disk / "checkpoints").names()
+    assert (small_disk / "0.monitor.csv").stat().st_size > 0
+
+
+def test_a_folder_that_becomes_read_only_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    model = model_in(tmp_path)
+    own = callbacks(tmp_path)
+    monkeypatch.setattr(np, "savez", refuse)
+    with pytest.warns(UserWarning, match="Read-only file system"):
+        model.learn(60, callback=own)
+    assert model.num_timesteps == 60 and len(own[0].evaluations_results) == 3
+    monkeypatch.undo()
+    own[0]._write_evaluations()
+    assert len(np.load(tmp_path / "evaluations.npz")["results"]) == 3
