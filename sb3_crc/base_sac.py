@@ -16,12 +16,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.sac.sac import SAC
 from typing_extensions import Self
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
+from sb3_crc.checked_sac import LOSSES, CheckedSAC
 from sb3_crc.convolutions import fastest_convolutions
 from sb3_crc.finite import LossHistory
 from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm, Speedometer, watched
@@ -35,11 +35,8 @@ from sb3_crc.settings import check_name
 from sb3_crc.stacking import stacked_frame_channels
 from sb3_crc.views import Views
 
-#: Metrics that must stay finite, beside the objectives
-LOSSES = ("train/critic_loss", "train/actor_loss", "train/ent_coef_loss")
 
-
-class BaseCRCSAC(SAC):
+class BaseCRCSAC(CheckedSAC):
     """What CRCSAC changes of SB3's SAC beside the algorithm itself; it does not train."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CRCPolicy, "MultiInputPolicy": CRCPolicy}
@@ -61,7 +58,6 @@ class BaseCRCSAC(SAC):
     _env_steps: int | None = None
     _frame_channels: int | None = None
     _speedometer: Speedometer
-    _collapse_alarm: CollapseAlarm
     _recorded: RecordedUpdates | None = None
 
     def between_updates(self) -> None:
@@ -137,30 +133,10 @@ class BaseCRCSAC(SAC):
         losses = {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)}
         return self._early_updates.taken() or LossHistory(self._n_updates + 1, losses)
 
-    def _check_stored(self, batch_size: int) -> None:
-        """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
-        assert self.replay_buffer is not None
-        stored = self.replay_buffer.size() * self.replay_buffer.n_envs
-        if batch_size > stored:
-            raise ValueError(
-                f"batch_size={batch_size} is more than the {stored} transitions that are stored: raise learning_starts "
-                f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
-            )
-
     def _record(self, history: LossHistory, batch_size: int) -> None:
-        """Log the means over one call of :meth:`train`."""
-        means = history.means()
-        if not np.isfinite(list(means.values())).all():
-            assert self.replay_buffer is not None
-            normalize, folder = self._vec_normalize_env, self.logger.dir
-            history.stop_if_not_finite(self.replay_buffer, batch_size, normalize, folder, self.num_timesteps)
+        super()._record(history, batch_size)
         for name in self._optimizers():
             self.logger.record(f"train/{name}", self._lr_schedules[name](self._current_progress_remaining))
-        for name, mean in means.items():
-            self.logger.record(name, mean)
-        if "representation/latent_std" in means:
-            self._collapse_alarm.check(means["representation/latent_std"], max(HEALTH_INTERVAL, len(history.updates)))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)

@@ -14,7 +14,7 @@ from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, augmented_input, tak
 from sb3_crc.base_sac import BaseCRCSAC
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
-from sb3_crc.finite import LossHistory
+from sb3_crc.finite import LossHistory, checked_step, parameters_of
 from sb3_crc.image_spaces import image_shape, image_space
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
@@ -34,6 +34,7 @@ CHOICES = {
     "balance": ("none", "grad_norm"),
     "precision": tuple(PRECISIONS),
     "replay_device": ("auto", "model", "cpu"),
+    "on_nonfinite": ("stop", "skip"),
 }
 
 
@@ -87,6 +88,8 @@ class CRCSAC(BaseCRCSAC):
         ``"model"``: beside the networks; ``"cpu"``
     :param overlap: make the update that follows a step while the environments step (:mod:`~sb3_crc.overlap`), with the same
         results; callbacks see the networks of after it within a step. For SubprocVecEnv, with a GPU or an idle core
+    :param on_nonfinite: what a loss, gradient, reward or observation that is not finite does. Adam never steps on one.
+        ``"stop"``: a FloatingPointError names it, and what led to it is saved; ``"skip"``: training goes on, and counts them
     :raises ValueError: for observations or settings that cannot work, naming the value and what is allowed
     """
 
@@ -127,6 +130,7 @@ class CRCSAC(BaseCRCSAC):
         compile: bool = False,
         replay_device: str = "auto",
         overlap: bool = False,
+        on_nonfinite: str = "stop",
         policy_kwargs: dict[str, Any] | None = None,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -173,6 +177,7 @@ class CRCSAC(BaseCRCSAC):
         self.compile = compile
         self.replay_device = replay_device
         self.overlap = overlap
+        self.on_nonfinite = on_nonfinite
         if _init_setup_model:
             self._setup_model()
 
@@ -293,27 +298,28 @@ class CRCSAC(BaseCRCSAC):
         metrics = {"train/critic_loss": critic_loss.detach()}
         optimizer = self.policy.encoder_optimizer if self._n_updates % self.auxiliary_interval == 0 else None
         if optimizer is None or self.reencode:
-            self._step(self.critic.optimizer, [*views.backward(td_gradients, encoder), *head_gradients])
+            metrics |= self._step("critic", self.critic.optimizer, [*views.backward(td_gradients, encoder), *head_gradients])
         if self.reencode:
             views.forget_encodings()
         if optimizer is None:
             return metrics
 
         auxiliary = self._auxiliary_gradients(views, td_gradients[0])
+        metrics |= auxiliary.metrics
         if self.joint_update:
             critic_gradients = views.backward(td_gradients, encoder, auxiliary.leaves)
-            self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
-            self._step(optimizer, auxiliary.own)
+            metrics |= self._step("critic", self.critic.optimizer, [*critic_gradients, *head_gradients])
+            metrics |= self._step("encoder", optimizer, auxiliary.own)
         else:
             if not self.reencode:
                 critic_gradients = views.backward(td_gradients, encoder, retain_graph=True)
             encoder_gradients = views.query.backward(auxiliary.leaves, encoder)
             if not self.reencode:
-                self._step(self.critic.optimizer, [*critic_gradients, *head_gradients])
-            self._step(optimizer, [*encoder_gradients, *auxiliary.own])
+                metrics |= self._step("critic", self.critic.optimizer, [*critic_gradients, *head_gradients])
+            metrics |= self._step("encoder", optimizer, [*encoder_gradients, *auxiliary.own])
         if self.reencode:
             views.forget_encodings()
-        return metrics | auxiliary.metrics
+        return metrics
 
     def _auxiliary_gradients(self, views: Views, td_gradient: th.Tensor) -> AuxiliaryGradients:
         policy, balance = self.policy, self.balance == "grad_norm"
@@ -343,13 +349,14 @@ class CRCSAC(BaseCRCSAC):
         actions, log_prob = self.actor.view_log_prob(anchor)
         q_values = self.critic.q_values(anchor.latent.detach(), actions, anchor.proprioception)  # (B, n_critics)
         actor_loss = (self._temperature() * log_prob - q_values.min(dim=1, keepdim=True).values).mean()
-        self._step(self.actor.optimizer, th.autograd.grad(actor_loss, _parameters(self.actor.optimizer)))
         metrics = {"train/actor_loss": actor_loss.detach(), "train/entropy": -log_prob.detach().mean()}
+        optimizer = self.actor.optimizer
+        metrics |= self._step("actor", optimizer, th.autograd.grad(actor_loss, parameters_of(optimizer)))
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob.detach() + float(self.target_entropy))).mean()
-            self._step(self.ent_coef_optimizer, th.autograd.grad(ent_coef_loss, [self.log_ent_coef]))
             metrics["train/ent_coef_loss"] = ent_coef_loss.detach()
+            metrics |= self._step("ent_coef", self.ent_coef_optimizer, th.autograd.grad(ent_coef_loss, [self.log_ent_coef]))
         return metrics | {"train/ent_coef": self._temperature()}
 
     def _update_targets(self) -> None:
@@ -364,15 +371,5 @@ class CRCSAC(BaseCRCSAC):
         """The entropy coefficient, shape ``(1,)`` or ``()``, without gradient."""
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
 
-    def _step(self, optimizer: th.optim.Optimizer, gradients: Sequence[th.Tensor | None]) -> None:
-        parameters = _parameters(optimizer)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        if self.max_grad_norm is not None:
-            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-        optimizer.step()
-        optimizer.zero_grad()
-
-
-def _parameters(optimizer: th.optim.Optimizer) -> list[th.Tensor]:
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    def _step(self, name: str, optimizer: th.optim.Optimizer, gradients: Sequence[th.Tensor | None]) -> dict[str, th.Tensor]:
+        return {f"train/{name}_gradient_norm": checked_step(optimizer, gradients, self.max_grad_norm)}

@@ -1,8 +1,8 @@
-"""Stop at the first loss that is not finite, and keep the batch it came from."""
+"""Numbers that are not finite: no step is made on them, what they came from is kept, and training stops or counts them."""
 
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +52,19 @@ class LossHistory:
         return dict(zip(records, means, strict=True))
 
     def first_failure(self) -> tuple[int, str, float] | None:
-        """:return: index of the update, name and value of the first loss that is not finite"""
+        """:return: index of the update, name and value of the first loss or gradient that is not finite"""
         for index, metrics in enumerate(self.updates):
             for name, value in metrics.items():
                 if name in self.losses and not math.isfinite(number := value.item()):
                     return index, name, number
         return None
+
+    def drop_failures(self) -> int:
+        """Forget all updates of which something is not finite. :return: how many those were"""
+        before = len(self.updates)
+        while (failure := self.first_failure()) is not None:
+            del self.updates[failure[0]], self.draws[failure[0]]
+        return before - len(self.updates)
 
     def stop_if_not_finite(
         self, buffer: ReplayBuffer, batch_size: int, env: VecNormalize | None, folder: str | None, agent_step: int
@@ -66,7 +73,7 @@ class LossHistory:
         Draw the batch of the first update that failed again, which needs the buffer as it was, and save it.
 
         :param folder: under which to save it; None: the system's for temporary files
-        :raises FloatingPointError: naming update, loss, value and the folder, if a loss is not finite
+        :raises FloatingPointError: naming update, loss, value and the folder, if a loss or gradient is not finite
         """
         failure = self.first_failure()
         if failure is None:
@@ -76,13 +83,82 @@ class LossHistory:
         numpy_state, torch_state = self.draws[index]
         np.random.set_state(numpy_state)
         batch = buffer.sample(batch_size, env=env)
-        target = Path(folder or tempfile.gettempdir()) / f"not_finite_at_update_{update}"
-        target.mkdir(parents=True, exist_ok=True)
+        target = _post_mortem(folder, f"update_{update}")
         th.save({**_on_host(batch._asdict()), "torch_rng_state": torch_state}, target / "batch.pt")
         raise FloatingPointError(
-            f"{name} is {value} at update {update}, agent step {agent_step}: the weights are lost, go on from the last "
-            f"checkpoint; the update's batch is saved in {target}"
+            f"{name} is {value} at update {update}, agent step {agent_step}: Adam has not stepped on it; go on from the last "
+            f"checkpoint, or with on_nonfinite='skip'; the update's batch is saved in {target}"
         )
+
+
+def checked_step(
+    optimizer: th.optim.Optimizer, gradients: Sequence[th.Tensor | None], max_norm: float | None = None
+) -> th.Tensor:
+    """
+    Step, if the gradient is finite and the optimizer is fused, as ours are; others step in any case.
+
+    :param optimizer: of some parameters
+    :param gradients: of these, in their order
+    :param max_norm: to which the gradient is clipped; None: it is not
+    :return: the gradient's norm before that, a scalar
+    """
+    parameters = parameters_of(optimizer)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    norm = th.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
+    if max_norm is not None:
+        th.nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
+    if optimizer.param_groups[0].get("fused"):  # torch's loss scaling asks the same of it
+        optimizer.found_inf = (~norm.isfinite()).float()  # type: ignore[attr-defined]
+    optimizer.step()
+    optimizer.zero_grad()
+    return norm.detach()
+
+
+def parameters_of(optimizer: th.optim.Optimizer) -> list[th.Tensor]:
+    """:return: what it steps on"""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def not_finite(values: Mapping[str, Any]) -> tuple[str, int, float] | None:
+    """
+    :param values: name -> array with one row for each environment, or a mapping of such
+    :return: name, environment and value of the first number that is not finite
+    """
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found = not_finite({f"{name}[{key!r}]": one for key, one in value.items()})
+            if found is not None:
+                return found
+            continue
+        array = np.asarray(value)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            place = np.argwhere(~np.isfinite(array))[0]
+            return name, int(place[0]), float(array[tuple(place)])
+    return None
+
+
+def save_transition(folder: str | None, agent_step: int, values: Mapping[str, Any]) -> Path:
+    """
+    :param folder: under which to save it; None: the system's for temporary files
+    :param agent_step: at which it happened
+    :param values: name -> array, or a mapping of such
+    :return: the folder with ``transition.npz``
+    """
+    target = _post_mortem(folder, f"agent_step_{agent_step}")
+    flat = {
+        f"{name}/{key}" if key else name: part
+        for name, value in values.items()
+        for key, part in (value.items() if isinstance(value, Mapping) else [("", value)])
+    }
+    np.savez(target / "transition.npz", **{name: np.asarray(value) for name, value in flat.items()})  # type: ignore[arg-type]
+    return target
+
+
+def _post_mortem(folder: str | None, when: str) -> Path:
+    target = Path(folder or tempfile.gettempdir()) / f"not_finite_at_{when}"
+    target.mkdir(parents=True, exist_ok=True)
+    return target
 
 
 def _on_host(values: Mapping[str, Any]) -> dict[str, Any]:

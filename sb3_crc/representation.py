@@ -63,7 +63,8 @@ def auxiliary_gradients(
         at_latent = th.zeros_like(td_gradient) if gradients[0] is None else gradients[0]
         norm = at_latent.norm()
         old = gradient_norms[index]
-        gradient_norms[index] = th.where(old > 0, NORM_DECAY * old + (1 - NORM_DECAY) * norm, norm)
+        moved = th.where(old > 0, NORM_DECAY * old + (1 - NORM_DECAY) * norm, norm)
+        gradient_norms[index] = th.where(norm.isfinite(), moved, old)
 
         scale = weights[name] / gradient_norms[index].clamp(min=1e-12) if balance else weights[name]
         leaves = [_add(*pair, scale) for pair in zip(leaves, gradients[:2], strict=True)]

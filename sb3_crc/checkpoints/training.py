@@ -29,6 +29,8 @@ COUNTERS = (
     "ep_info_buffer",
     "ep_success_buffer",
     "_env_steps",
+    "_skipped_updates",
+    "_skipped_transitions",
 )
 #: Of a callback: what every callback has of the training, and what only describes the present moment
 NOT_STATE = ("locals", "globals", "verbose")
