@@ -16,6 +16,7 @@ from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory, checked_step, parameters_of
 from sb3_crc.image_spaces import image_shape, image_space
+from sb3_crc.memory import is_out_of_memory, largest_that_fits
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
@@ -250,8 +251,16 @@ class CRCSAC(BaseCRCSAC):
         self.between_updates()
         self._n_updates += 1
         metrics = history.begin()
-        views = self._sample_views(batch_size)
-        metrics |= self._update(views) if self._recorded is None else self._replayed(views)
+        try:
+            views = self._sample_views(batch_size)
+            metrics |= self._update(views) if self._recorded is None else self._replayed(views)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        else:
+            return
+        raise MemoryError(self._what_fits(batch_size, reason))  # here, where the error holds no tensors any more
 
     def _update(self, views: Views) -> dict[str, th.Tensor]:
         with self._instruments(views) as health:
@@ -320,6 +329,20 @@ class CRCSAC(BaseCRCSAC):
         if self.reencode:
             views.forget_encodings()
         return metrics
+
+    def _what_fits(self, batch_size: int, reason: str) -> str:
+        def attempt(size: int) -> None:
+            views = self._sample_views(size)
+            latents = [anchor.latent for anchor in views.anchors]
+            gradients = th.autograd.grad(self._critic_loss(views), latents)
+            auxiliary_leaves = (
+                self._auxiliary_gradients(views, gradients[0]).leaves if self.policy.objectives else (None, None)
+            )
+            views.backward(gradients, list(self.critic.features_extractor.parameters()), auxiliary_leaves)
+
+        fits = largest_that_fits(attempt, batch_size)
+        hint = f"batch_size={fits} fits" if fits else "no smaller one fits either: the networks or frames are too large"
+        return f"batch_size={batch_size} does not fit into the memory of {self.device} ({reason}); {hint}"
 
     def _auxiliary_gradients(self, views: Views, td_gradient: th.Tensor) -> AuxiliaryGradients:
         policy, balance = self.policy, self.balance == "grad_norm"

@@ -1,7 +1,8 @@
 """How much memory is free, and who keeps it."""
 
 import ctypes
-from collections.abc import Iterator
+import gc
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -54,6 +55,34 @@ def _glibc() -> ctypes.CDLL | None:
     except (AttributeError, OSError, TypeError):
         return None
     return libc
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """:return: whether torch or Python could not allocate something"""
+    words = ("not enough memory", "can't allocate memory", "out of memory", "could not create a primitive", "Cannot allocate")
+    return isinstance(error, MemoryError | th.OutOfMemoryError) or (
+        isinstance(error, RuntimeError) and any(word in str(error) for word in words)
+    )
+
+
+def largest_that_fits(attempt: Callable[[int], object], size: int) -> int:
+    """
+    :param attempt: does something with a batch of a size, and raises if memory is short
+    :param size: that does not fit
+    :return: the first of its halves, quarters and so on that does; 0: none
+    """
+    while (size := size // 2) > 0:
+        gc.collect()
+        if th.cuda.is_available():
+            th.cuda.empty_cache()
+        try:
+            attempt(size)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+        else:
+            return size
+    return 0
 
 
 def free_memory(device: th.device) -> int:

@@ -387,3 +387,40 @@ def test_skipped_transitions_are_not_stored(tmp_path: Path) -> None:
     assert model.replay_buffer.interrupted[stored + 4]  # no return reaches over the gap
     model.save(tmp_path / "model")
     assert CRCSAC.load(tmp_path / "model")._skipped_transitions == 2
+
+
+# -- Memory ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("fits", "hint"), [(5, "batch_size=4 fits"), (0, "no smaller one fits either")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        th.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB"),
+        RuntimeError("DefaultCPUAllocator: not enough memory"),
+    ],
+)
+def test_where_memory_is_short_the_batch_that_fits_is_named(
+    error: Exception, fits: int, hint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = make_model()
+    convolve = type(model.critic.features_extractor).convolve
+
+    def short(self: Any, images: Any) -> Any:
+        if len(images) > fits:
+            raise error
+        return convolve(self, images)
+
+    monkeypatch.setattr(type(model.critic.features_extractor), "convolve", short)
+    before = parameters(model)
+    message = rf"batch_size=16 does not fit into the memory of cpu \({type(error).__name__}: .*memory.*\); {hint}"
+    with pytest.raises(MemoryError, match=message):
+        model.train(gradient_steps=1, batch_size=16)
+    assert all(map(th.equal, before, parameters(model)))
+
+
+def test_other_errors_of_an_update_are_raised_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model()
+    monkeypatch.setattr(model, "_critic_loss", lambda views: (_ for _ in ()).throw(RuntimeError("mat1 and mat2")))
+    with pytest.raises(RuntimeError, match="mat1 and mat2"):
+        model.train(gradient_steps=1, batch_size=16)

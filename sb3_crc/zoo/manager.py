@@ -21,7 +21,7 @@ from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
 from stable_baselines3.common.utils import LinearSchedule, configure_logger
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
@@ -32,6 +32,7 @@ from sb3_crc.experiments.provenance import provenance
 from sb3_crc.experiments.runs import PROVENANCE, write_json
 from sb3_crc.presets import PRESETS
 from sb3_crc.stock import STOCK
+from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
 from sb3_crc.zoo.messages import say
 from sb3_crc.zoo.resume import CHECKPOINTS, Plan, write_plan
 from sb3_crc.zoo.search import ARGUMENTS, constructor_arguments, sample
@@ -59,6 +60,8 @@ class CRCExperimentManager(ExperimentManager):
         if kwargs.get("config") is None and own_config.exists() and ours:
             kwargs["config"] = str(own_config)
         super().__init__(args, algo, env_id, *rest, **kwargs)
+        if self.vec_env_class is SubprocVecEnv:
+            self.vec_env_class = WatchedSubprocVecEnv
         if self.plan.run is not None:
             self.save_path = str(self.plan.run)
             self.params_path = str(self.plan.run / str(self.env_name))
@@ -126,6 +129,8 @@ class CRCExperimentManager(ExperimentManager):
         self.callbacks.append(checkpoint)  # the last one: the others have started when it restores them
         try:
             super().learn(model)
+        except WorkerError as error:
+            raise SystemExit(f"{error}\n{self._how_to_go_on(model.num_timesteps)}") from None
         finally:
             checkpoint.close()
             type(self).stopped_by = checkpoint.stopped_by

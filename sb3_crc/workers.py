@@ -1,0 +1,183 @@
+"""Environments in processes of their own, which are watched: one that has died or hangs is named, and may be replaced."""
+
+import multiprocessing
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvStepReturn
+from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs, _worker
+
+#: Seconds in which an environment must answer
+TIMEOUT = 300.0
+
+
+class WorkerError(RuntimeError):
+    """
+    The process of an environment has died, or does not answer.
+
+    :param index: of the environment
+    :param message: what has happened
+    """
+
+    def __init__(self, index: int, message: str):
+        super().__init__(message)
+        self.index = index
+
+
+class WatchedSubprocVecEnv(SubprocVecEnv):
+    """
+    SB3's SubprocVecEnv, which would wait for ever for a process that hangs, and names none that has died.
+
+    :param env_fns: make the environments
+    :param start_method: as in SB3
+    :param timeout: seconds in which each must answer
+    :param restart: replace one that has died or hangs in a step by a new one: its episode ends there, truncated, and the next
+        one begins by another seed. Otherwise, and outside of steps, a :class:`WorkerError` names it
+    """
+
+    def __init__(
+        self,
+        env_fns: list[Callable[[], gym.Env[Any, Any]]],
+        start_method: str | None = None,
+        *,
+        timeout: float = TIMEOUT,
+        restart: bool = False,
+    ):
+        self.timeout = timeout
+        self.restart = restart
+        #: How often one was replaced
+        self.restarts = 0
+        self._env_fns = env_fns
+        self._last: list[Any] = [None] * len(env_fns)
+        super().__init__(env_fns, start_method)
+        methods = multiprocessing.get_all_start_methods()
+        self._start_method = start_method or ("forkserver" if "forkserver" in methods else "spawn")
+        self.remotes = tuple(
+            _WatchedPipe(remote, process, index, timeout)
+            for index, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True))
+        )
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """:param actions: ``(N, A)``"""
+        for remote, action in zip(self.remotes, actions, strict=True):
+            remote.send_if_alive(("step", action))
+        self.waiting = True
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """:raises WorkerError: for the first environment that does not answer, unless it is replaced"""
+        results = []
+        for index, remote in enumerate(self.remotes):
+            try:
+                results.append(remote.recv())
+            except WorkerError:
+                if not self.restart:
+                    self.waiting = False
+                    raise
+                results.append(self._replaced(index))
+        self.waiting = False
+        observations, rewards, dones, infos, self.reset_infos = zip(*results, strict=True)
+        self._last = list(observations)
+        stacked: Any = _stack_obs(observations, self.observation_space)
+        return stacked, np.stack(rewards), np.stack(dones), list(infos)
+
+    def reset(self) -> Any:
+        """:return: the first observations of new episodes"""
+        observations = super().reset()
+        rows = range(self.num_envs)
+        if isinstance(observations, dict):
+            self._last = [{key: values[row] for key, values in observations.items()} for row in rows]
+        else:
+            self._last = [observations[row] for row in rows]  # type: ignore[index]
+        return observations
+
+    def close(self) -> None:
+        """End all processes, also those that do not listen any more."""
+        if self.closed:
+            return
+        for remote, process in zip(self.remotes, self.processes, strict=True):
+            if not self.waiting:
+                remote.send_if_alive(("close", None))
+            process.join(5.0 if not self.waiting else 0.0)
+            if process.is_alive():
+                process.kill()
+                process.join()
+            remote.close()
+        self.closed = True
+
+    def _replaced(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
+        """:return: the end of the lost episode, as a worker tells of one"""
+        self.restarts += 1
+        self.processes[index].kill()
+        self.processes[index].join()
+        self.remotes[index].close()
+        context: Any = multiprocessing.get_context(self._start_method)
+        remote, work_remote = context.Pipe()
+        arguments = (work_remote, remote, CloudpickleWrapper(self._env_fns[index]))
+        process = context.Process(target=_worker, args=arguments, daemon=True)
+        process.start()
+        work_remote.close()
+        watched = _WatchedPipe(remote, process, index, self.timeout)
+        self.processes[index] = process
+        self.remotes = (*self.remotes[:index], watched, *self.remotes[index + 1 :])
+        watched.send(("reset", (1_000_003 * self.restarts + index, None)))
+        observation, reset_info = watched.recv()
+        info = {"TimeLimit.truncated": True, "terminal_observation": self._last[index], "restarted": True}
+        return observation, 0.0, True, info, reset_info
+
+
+class _WatchedPipe:
+    """A pipe to a worker that knows whether somebody is at its other end."""
+
+    def __init__(self, pipe: Any, process: Any, index: int, timeout: float):
+        self._pipe = pipe
+        self._process = process
+        self._index = index
+        self._timeout = timeout
+        self._asked: Any = None
+
+    def send(self, message: Any) -> None:
+        self._asked = message[0]
+        try:
+            self._pipe.send(message)
+        except OSError:
+            raise self._dead() from None
+
+    def send_if_alive(self, message: Any) -> None:
+        self._asked = message[0]
+        try:
+            self._pipe.send(message)
+        except OSError:  # told of when its answer is awaited
+            pass
+
+    def recv(self) -> Any:
+        deadline = time.monotonic() + self._timeout
+        try:
+            while not self._pipe.poll(0.5):
+                if not self._process.is_alive() and not self._pipe.poll(0):
+                    raise self._dead()
+                if time.monotonic() > deadline:
+                    raise WorkerError(
+                        self._index,
+                        f"environment {self._index} (process {self._process.pid}) has not answered {self._asked!r} within "
+                        f"{self._timeout:g} s: it hangs",
+                    )
+            return self._pipe.recv()
+        except (EOFError, ConnectionError):
+            raise self._dead() from None
+
+    def close(self) -> None:
+        self._pipe.close()
+
+    def _dead(self) -> WorkerError:
+        self._process.join(1.0)
+        code = self._process.exitcode
+        how = f"was killed by signal {-code}" if code is not None and code < 0 else f"has ended with exit code {code}"
+        return WorkerError(
+            self._index,
+            f"environment {self._index} (process {self._process.pid}) {how}, asked to {self._asked!r}: what it said last stands "
+            "above, in the error output",
+        )

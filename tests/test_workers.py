@@ -1,0 +1,144 @@
+"""Environments in processes that die, hang or raise."""
+
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
+
+from sb3_crc import CRCSAC
+from sb3_crc.checkpoints.callback import TrainingCheckpoint
+from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
+from tests.checkpoints.test_callback import SETTINGS, STEPS, assert_equal, cartpole
+from tests.conftest import POLICY_KWARGS, NoiseEnv
+
+
+class Failing(NoiseEnv):
+    """Its third step kills its process, hangs or raises, if there is no file that says it has done so."""
+
+    def __init__(self, how: str, marker: Path | None = None):
+        super().__init__(channels=3, length=5)
+        self.how, self.marker = how, marker
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.steps == 2 and self.how != "works" and not (self.marker and self.marker.exists()):
+            if self.marker is not None:
+                self.marker.touch()
+            if self.how == "dies":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "hangs":
+                time.sleep(600)
+            raise ZeroDivisionError("in the simulator")
+        return super().step(action)
+
+
+def environments(how: str, marker: Path | None = None, **own: Any) -> WatchedSubprocVecEnv:
+    make = [partial(Failing, "works"), partial(Failing, how, marker)]
+    return WatchedSubprocVecEnv(make, **{"timeout": 3.0, **own})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("dies", r"environment 1 \(process \d+\) was killed by signal 9, asked to 'step'"),
+        ("hangs", r"environment 1 \(process \d+\) has not answered 'step' within 3 s: it hangs"),
+        ("raises", r"environment 1 \(process \d+\) has ended with exit code 1, asked to 'step'"),
+    ],
+)
+def test_an_environment_that_fails_is_named(how: str, message: str) -> None:
+    env = environments(how)
+    env.seed(0)
+    env.reset()
+    for _ in range(2):
+        env.step(np.zeros((2, 2)))
+    with pytest.raises(WorkerError, match=message) as error:
+        env.step(np.zeros((2, 2)))
+    assert error.value.index == 1
+    if how == "dies":
+        with pytest.raises(WorkerError, match="environment 1"):
+            env.get_attr("steps")
+    began = time.monotonic()
+    env.close()
+    assert time.monotonic() - began < 10 and not any(process.is_alive() for process in env.processes)
+
+
+def test_without_a_failure_it_is_sb3s() -> None:
+    results = []
+    for cls in (SubprocVecEnv, WatchedSubprocVecEnv):
+        env = cls([partial(Failing, "works")] * 2)
+        env.seed(7)
+        observations = [env.reset()]
+        for _ in range(7):
+            observation, rewards, dones, infos = env.step(np.full((2, 2), 0.5))
+            observations.append(observation)
+        results.append((np.stack(observations), rewards, dones, [sorted(info) for info in infos], env.get_attr("steps")))
+        env.close()
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("how", ["dies", "hangs", "raises"])
+def test_a_failing_environment_is_replaced_and_its_episode_truncated(how: str, tmp_path: Path) -> None:
+    env = environments(how, tmp_path / "failed", restart=True)
+    env.seed(0)
+    env.reset()
+    seen = [env.step(np.zeros((2, 2))) for _ in range(4)]
+    observations, rewards, dones, infos = seen[2]
+    assert dones.tolist() == [False, True] and rewards[1] == 0 and env.restarts == 1
+    assert infos[1]["TimeLimit.truncated"] and infos[1]["restarted"]
+    assert np.array_equal(infos[1]["terminal_observation"], seen[1][0][1])
+    assert not np.array_equal(observations[1], seen[1][0][1])
+    assert env.get_attr("steps") == [4, 1]
+    env.close()
+
+
+def test_a_training_goes_on_with_a_replaced_environment(tmp_path: Path) -> None:
+    env = VecFrameStack(environments("dies", tmp_path / "failed", restart=True), 3, channels_order="first")
+    model = CRCSAC(
+        "CnnPolicy", env, batch_size=8, buffer_size=100, learning_starts=20, policy_kwargs=POLICY_KWARGS, seed=0, n_steps=2
+    )
+    model.learn(60)
+    env.close()
+    assert model.num_timesteps == 60 and model._n_updates == 20
+
+
+class DiesOnce(Monitor):  # type: ignore[type-arg]
+    """A task whose process is killed at one of its steps, once."""
+
+    def __init__(self, marker: Path | None, seed: int):
+        super().__init__(cartpole(seed))
+        self.marker, self.count = marker, 0
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        if self.marker is not None and self.count == 33 and not self.marker.exists():
+            self.marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
+def train(folder: Path, marker: Path | None) -> CRCSAC:
+    env = WatchedSubprocVecEnv([partial(DiesOnce, marker, 0)], timeout=60)
+    model = CRCSAC("CnnPolicy", env, seed=0, **SETTINGS)
+    checkpoint = TrainingCheckpoint(folder, every=10)
+    try:
+        model.learn(STEPS, callback=checkpoint)
+    finally:
+        checkpoint.close()
+        env.close()
+    return model
+
+
+def test_a_training_whose_environment_died_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", None)
+    marker = tmp_path / "died"
+    with pytest.raises(WorkerError, match="environment 0"):
+        train(tmp_path / "run", marker)
+    assert marker.exists() and sorted(path.name for path in (tmp_path / "run").glob("0*"))[-1] == "000000000030"
+    assert_equal(train(tmp_path / "run", marker), whole)
