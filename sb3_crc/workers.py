@@ -3,6 +3,7 @@
 import multiprocessing
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
@@ -79,7 +80,8 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
                     raise
                 results.append(self._replaced(index))
         self.waiting = False
-        observations, rewards, dones, infos, self.reset_infos = zip(*results, strict=True)
+        observations, rewards, dones, infos, reset_infos = zip(*results, strict=True)
+        self.reset_infos = list(reset_infos)
         self._last = list(observations)
         stacked: Any = _stack_obs(observations, self.observation_space)
         return stacked, np.stack(rewards), np.stack(dones), list(infos)
@@ -91,7 +93,7 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         if isinstance(observations, dict):
             self._last = [{key: values[row] for key, values in observations.items()} for row in rows]
         else:
-            self._last = [observations[row] for row in rows]  # type: ignore[index]
+            self._last = [observations[row] for row in rows]
         return observations
 
     def close(self) -> None:
@@ -148,10 +150,8 @@ class _WatchedPipe:
 
     def send_if_alive(self, message: Any) -> None:
         self._asked = message[0]
-        try:
+        with suppress(OSError):  # told of when its answer is awaited
             self._pipe.send(message)
-        except OSError:  # told of when its answer is awaited
-            pass
 
     def recv(self) -> Any:
         deadline = time.monotonic() + self._timeout
@@ -178,6 +178,6 @@ class _WatchedPipe:
         how = f"was killed by signal {-code}" if code is not None and code < 0 else f"has ended with exit code {code}"
         return WorkerError(
             self._index,
-            f"environment {self._index} (process {self._process.pid}) {how}, asked to {self._asked!r}: what it said last stands "
-            "above, in the error output",
+            f"environment {self._index} (process {self._process.pid}) {how}, asked to {self._asked!r}: what it said last "
+            "stands above, in the error output",
         )
