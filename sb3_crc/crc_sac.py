@@ -335,10 +335,8 @@ class CRCSAC(BaseCRCSAC):
             views = self._sample_views(size)
             latents = [anchor.latent for anchor in views.anchors]
             gradients = th.autograd.grad(self._critic_loss(views), latents)
-            auxiliary_leaves = (
-                self._auxiliary_gradients(views, gradients[0]).leaves if self.policy.objectives else (None, None)
-            )
-            views.backward(gradients, list(self.critic.features_extractor.parameters()), auxiliary_leaves)
+            leaves = self._auxiliary_gradients(views, gradients[0]).leaves
+            views.backward(gradients, list(self.critic.features_extractor.parameters()), leaves)
 
         fits = largest_that_fits(attempt, batch_size)
         hint = f"batch_size={fits} fits" if fits else "no smaller one fits either: the networks or frames are too large"

@@ -28,6 +28,7 @@ class PlacedReplayBuffer(ReplayBuffer):
 
     @device.setter
     def device(self, device: th.device | str) -> None:
+        """Let samples come there, and frames lie there that have no device of their own."""
         self._device = th.device(device)
         if hasattr(self, "store"):
             self.store.to(self.frame_device)
@@ -39,6 +40,7 @@ class PlacedReplayBuffer(ReplayBuffer):
 
     @frame_device.setter
     def frame_device(self, device: th.device | str | None) -> None:
+        """Move the frames."""
         self._frame_device = None if device is None else th.device(device)
         self.store.to(self.frame_device)
 
