@@ -20,6 +20,8 @@ from sb3_crc.settings import check_name
 from sb3_crc.transfers import to_device
 
 ImageSize = int | tuple[int, int]
+#: Of a picture that is read from a file
+MOST_PIXELS = 1 << 26
 
 
 class StoredImages(Protocol):
@@ -197,10 +199,22 @@ def _pictures(source: str | None, size: tuple[int, int], device: th.device) -> t
     files = sorted(path for path in Path(source).rglob("*") if path.suffix.lower() in endings)[:1_000]
     if not files:
         raise ValueError(f"random_overlay: no pictures ({', '.join(endings)}) in {source!r}")
+    pictures = np.stack([_picture(file, size) for file in files])
+    return th.from_numpy(pictures).permute(0, 3, 1, 2).contiguous()
+
+
+def _picture(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """:return: uint8 ``(*size, 3)``; :raises ValueError: for what is no picture, or one that is too large to be decoded"""
     from PIL import Image
 
-    pictures = [np.asarray(Image.open(file).convert("RGB").resize(size[::-1])) for file in files]
-    return th.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).contiguous()
+    try:
+        with Image.open(file) as picture:
+            width, height = picture.size
+            if width * height > MOST_PIXELS:
+                raise ValueError(f"it has {width} x {height} pixels; at most {MOST_PIXELS} of them are decoded")
+            return np.asarray(picture.convert("RGB").resize(size[::-1]))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ValueError(f"random_overlay: {file} cannot be read as a picture: {error}") from error
 
 
 def checked_size(images: Images, size: ImageSize) -> tuple[int, int]:

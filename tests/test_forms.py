@@ -1,6 +1,7 @@
 """The forms of the algorithm: each setting changes what its documentation says, and nothing fails silently."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -262,6 +263,21 @@ def test_random_overlay_blends_one_picture_over_the_stack(tmp_path: Any) -> None
     assert len(procedural.unique(dim=0)) > 30
     with pytest.raises(ValueError, match="no pictures"):
         random_overlay(images, source=str(tmp_path / "nothing"))
+
+
+def test_pictures_that_are_none_or_too_large_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from PIL import Image
+
+    images = th.zeros(2, 3, 8, 8, dtype=th.uint8)
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "no.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"no\.png cannot be read as a picture"):
+        random_overlay(images, source=str(tmp_path / "text"))
+    (tmp_path / "large").mkdir()
+    Image.new("RGB", (30, 40)).save(tmp_path / "large" / "large.png")
+    monkeypatch.setattr("sb3_crc.augmentations.MOST_PIXELS", 1_000)
+    with pytest.raises(ValueError, match=r"large\.png.*it has 30 x 40 pixels; at most 1000 of them are decoded"):
+        random_overlay(images, source=str(tmp_path / "large"))
 
 
 def test_crc_release_reproduces_its_rows() -> None:

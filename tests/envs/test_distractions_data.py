@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from sb3_crc import make_dmc
+from sb3_crc.envs.distractions import clips as clips_module
 from sb3_crc.envs.distractions import labels
 from sb3_crc.envs.distractions.clips import PROCEDURAL_FRAMES, ProceduralClip, StoredClip, bilinear, find_clips
 from sb3_crc.envs.distractions.colours import DEFAULT, generated_table, read_table
@@ -283,6 +285,45 @@ def test_clips_that_are_none(tmp_path: Path, name: str, content: Any, message: s
         np.save(tmp_path / name, content)
     with pytest.raises(ValueError, match=message):
         StoredClip(tmp_path / name, 6)
+
+
+def bomb(path: Path, gigabytes: int) -> None:
+    """An npz of a few megabytes that would be as many gigabytes."""
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("frames.npy", "w", force_zip64=True) as file,
+    ):
+        shape = (gigabytes * 1000, 1000, 333, 3)
+        np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        for _ in range(gigabytes):
+            for _ in range(64):
+                file.write(bytes(1 << 24))
+
+
+@pytest.mark.parametrize("name", ["wide.npy", "wide.mp4", "bomb.npz"])
+def test_clips_that_are_too_large_are_not_decoded(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clips_module, "MOST_PIXELS", 32 * 20)
+    monkeypatch.setattr(clips_module, "MOST_BYTES", 1 << 29)
+    path = tmp_path / name
+    if name == "bomb.npz":
+        bomb(path, 1)
+        assert path.stat().st_size < 1 << 21
+        message = r"bomb\.npz is no clip.*unpacked it would have \d+ bytes; at most 536870912 are read"
+    else:
+        message = rf"{name}: its frames have 64 x 32 pixels; at most 640 of them are decoded"
+        frames = np.zeros((3, 32, 64, 3), np.uint8)
+        if name.endswith("npy"):
+            np.save(path, frames)
+        else:
+            av = pytest.importorskip("av")
+            with av.open(str(path), "w") as container:
+                stream = container.add_stream("mpeg4", rate=10)
+                stream.width, stream.height, stream.pix_fmt = 64, 32, "yuv420p"
+                for frame in frames:
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+                container.mux(stream.encode())
+    with pytest.raises(ValueError, match=message):
+        StoredClip(path, 6)
 
 
 @pytest.mark.parametrize("mode", ["video_easy", "video_hard", "dcs_easy", "dcs_hard_static"])

@@ -22,6 +22,8 @@ from sb3_crc.atomic import atomic_write
 SUFFIXES = (".mp4", ".npz", ".npy")
 #: Frames of one clip: at 100 x 100 pixels the longest take 300 MB on disk
 SHORTEST, LONGEST = 2, 10_000
+#: Pixels of one frame, and bytes of a whole npz, at most: more is refused before it is decoded
+MOST_PIXELS, MOST_BYTES = 1 << 24, 1 << 32
 #: Of the files that resized clips are kept in
 FORMAT = 1
 PROCEDURAL_FRAMES = 600
@@ -178,6 +180,11 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
         yield from _decoded_video(path)
         return
     try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                unpacked = sum(member.file_size for member in archive.infolist())
+            if unpacked > MOST_BYTES:
+                raise ValueError(f"unpacked it would have {unpacked} bytes; at most {MOST_BYTES} are read")
         content: Any = np.load(path, mmap_mode="r")
         if isinstance(content, np.lib.npyio.NpzFile):
             with content:
@@ -188,7 +195,13 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
         raise ValueError(f"{path} is no clip, one array of frames: {error}") from error
     if content.ndim != 4 or content.shape[3] != 3 or content.dtype != np.uint8 or 0 in content.shape[1:]:
         raise ValueError(f"{path} holds {content.dtype} {content.shape}; a clip is uint8 (frames, height, width, 3)")
+    _check_size(path, content.shape[2], content.shape[1])
     yield from content
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"{path}: its frames have {width} x {height} pixels; at most {MOST_PIXELS} of them are decoded")
 
 
 def _decoded_video(path: Path) -> Iterator[np.ndarray]:
@@ -199,7 +212,9 @@ def _decoded_video(path: Path) -> Iterator[np.ndarray]:
 
     try:
         with av.open(str(path)) as container:
+            _check_size(path, container.streams.video[0].width, container.streams.video[0].height)
             for frame in container.decode(video=0):
+                _check_size(path, frame.width, frame.height)  # which may change within a stream
                 yield frame.to_ndarray(format="rgb24")
     except (av.FFmpegError, IndexError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a video: {error}") from error
