@@ -85,7 +85,7 @@ def with_overrides(settings: Mapping[str, Any], overrides: Mapping[str, Any]) ->
     """
     changed: dict[str, Any] = _unshared(settings)
     for path, value in overrides.items():
-        *parents, name = path.split(".")
+        *parents, name = path.split(".") if isinstance(path, str) else [""]
         if not all([*parents, name]):
             raise ValueError(f"{path!r} is no path: there is nothing before or behind one of its dots")
         inner = changed

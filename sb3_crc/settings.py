@@ -16,11 +16,11 @@ def check_name(argument: str, value: object, known: Iterable[str]) -> None:
 
 
 def _is_share(value: Any) -> bool:
-    return bool(0 <= value <= 1)
+    return not isinstance(value, bool) and bool(0 <= value <= 1)
 
 
 def _is_count(value: Any, least: int = 1) -> bool:
-    return isinstance(value, Integral) and int(value) >= least
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
 
 
 _SHARE: tuple[Callable[[Any], bool], str] = _is_share, "in [0, 1]"

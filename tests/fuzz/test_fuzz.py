@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import yaml
 from hypothesis import strategies as st
 
@@ -387,6 +388,22 @@ def check_buffers(flips: list[tuple[float, int]], kept: float) -> None:
 
 
 test_buffers, test_buffers_long = tiers(500, flips=DAMAGE, kept=KEPT)(check_buffers)
+
+
+# -- What was found ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["tau", "encoder_tau", "gamma", "policy_delay", "n_steps"])
+def test_true_is_no_number(name: str) -> None:
+    """``tau=True`` was let through, and failed at the first target update."""
+    with pytest.raises(ValueError, match=f"{name}=True must be"):
+        CRCSAC("CnnPolicy", NoiseEnv(size=36), **{**TINY, name: True})
+
+
+def test_a_path_that_is_no_text_is_refused() -> None:
+    """A sweep with ``null:`` among a variant's changes ended in an AttributeError."""
+    with pytest.raises(ValueError, match="None is no path"):
+        with_overrides({"a": 1}, {None: 2})  # type: ignore[dict-item]
 
 
 def test_the_unedited_files_are_read() -> None:
