@@ -14,7 +14,7 @@ from torch import nn
 from sb3_crc.augmentations import ImageSize, center_crop
 from sb3_crc.convolutions import ConvReLU, conv_relu
 from sb3_crc.image_spaces import image_shape, image_space, split_observations
-from sb3_crc.settings import check_name
+from sb3_crc.settings import check_name, check_sizes
 
 #: A batch of images, or a mapping in which there is one
 Observations = th.Tensor | Mapping[str, th.Tensor]
@@ -61,6 +61,8 @@ class PixelEncoder(BaseFeaturesExtractor):
         initialization: str = "delta_orthogonal",
     ):
         frame_stack, *frame_size = image_shape(image_space(observation_space))
+        check_sizes(channels=channels, strides=strides, features_dim=features_dim, kernel_size=kernel_size)
+        check_sizes(frame_channels=frame_channels)
         super().__init__(observation_space, features_dim)
         if len(channels) != len(strides):
             raise ValueError(f"channels={tuple(channels)} and strides={tuple(strides)} must have the same length")

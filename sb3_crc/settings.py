@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
 from typing import Any
 
@@ -13,6 +13,13 @@ def check_name(argument: str, value: object, known: Iterable[str]) -> None:
     if value not in names:
         nearest = difflib.get_close_matches(str(value), names, n=1, cutoff=0)[0]
         raise ValueError(f"unknown {argument} {value!r}; did you mean {nearest!r}? Known: {', '.join(names)}")
+
+
+def check_sizes(**sizes: int | Sequence[int]) -> None:
+    """:raises ValueError: for the first of them that is, or has, a number below 1, or that has none"""
+    for name, size in sizes.items():
+        if min(size if isinstance(size, Sequence) else [size], default=0) < 1:
+            raise ValueError(f"{name}={size} must be at least 1")
 
 
 def _is_share(value: Any) -> bool:

@@ -32,7 +32,16 @@ from sb3_crc.stock import STOCK
 
 #: Settings of a configuration that are rl_zoo3's, not the algorithm's
 ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs", "callback"}
-SWEEP_KEYS = {"tasks", "seeds", "env_steps", "eval_every", "eval_episodes", "variants", "conf_file"}
+#: Key of a sweep -> of which type it must be, and that in words
+SWEEP_KEYS: dict[str, tuple[Any, str]] = {
+    "tasks": (list, "a list of domain-task"),
+    "seeds": (int | list, "a number of trainings, or a list of whole numbers"),
+    "env_steps": (int, "a whole number"),
+    "eval_every": (int, "a whole number"),
+    "eval_episodes": (int, "a whole number"),
+    "variants": (dict, "a mapping from names to changes"),
+    "conf_file": (str | Path, "a path"),
+}
 
 
 class _UniqueKeys(yaml.SafeLoader):
@@ -152,6 +161,7 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
         check_name(f"{file}: key", key, sorted(SWEEP_KEYS))
     if lacking := sorted({"tasks", "seeds", "env_steps", "variants"} - content.keys()):
         raise ValueError(f"{file} is no sweep: it has no {', '.join(lacking)}")
+    _check_types(file, content)
     seeds = content["seeds"]
     conf_file = content.get("conf_file")
     return _grid(
@@ -163,6 +173,21 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
         eval_episodes=content.get("eval_episodes", 10),
         conf_file=None if conf_file is None else file.parent / conf_file,
     )
+
+
+def _check_types(file: Path, content: Mapping[str, Any]) -> None:
+    """:raises ValueError: naming file and key, for what is of another type than a sweep's"""
+    for key, value in content.items():
+        kind, words = SWEEP_KEYS[key]
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ValueError(f"{file}: {key} must be {words}; it is {value!r}")
+    for method, changes in content["variants"].items():
+        if not isinstance(method, str) or not isinstance(changes, dict | None):
+            raise ValueError(f"{file}: variants.{method} must be a mapping of changes with a name; it is {changes!r}")
+    for key, kind in (("tasks", str), ("seeds", int)):
+        wrong = [one for one in content[key] if type(one) is not kind] if isinstance(content[key], list) else []
+        if wrong:
+            raise ValueError(f"{file}: {key} must be {SWEEP_KEYS[key][1]}; {wrong[0]!r} is among them")
 
 
 def convex_weights(file: Path) -> dict[str, tuple[float, float, float]]:
@@ -204,7 +229,7 @@ def _grid(
     for method, changes in variants.items():
         if not str(method).strip(" .") or set(str(method)) & set("/\\\0"):
             raise ValueError(f"variant {method!r}: its name becomes that of a folder, so there can be no slash in it")
-        overrides = dict(changes)
+        overrides = dict(changes or {})
         preset = overrides.pop("preset", method)
         check_name(f"preset of {method!r}", preset, [*PRESETS, *STOCK])
         file = configuration_file(preset) if conf_file is None else conf_file

@@ -400,6 +400,43 @@ def test_true_is_no_number(name: str) -> None:
         CRCSAC("CnnPolicy", NoiseEnv(size=36), **{**TINY, name: True})
 
 
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"channels": [8, -1], "strides": [1, 1]}, r"channels=\[8, -1\] must be at least 1"),
+        ({"channels": [8, 0], "strides": [1, 1]}, r"channels=\[8, 0\] must be"),
+        ({"channels": [8], "strides": [0]}, r"strides=\[0\] must be"),
+        ({"channels": [], "strides": []}, r"channels=\[\] must be"),
+        ({"features_dim": 0}, "features_dim=0 must be"),
+        ({"frame_channels": 0, "frame_differences": 4.0}, "frame_channels=0 must be"),
+    ],
+)
+def test_an_encoder_of_nothing_is_refused(own: dict[str, Any], message: str) -> None:
+    """These were torch's errors, or an assertion of SB3's."""
+    with pytest.raises(ValueError, match=message):
+        CRCSAC("CnnPolicy", NoiseEnv(size=36), **{**TINY, "policy_kwargs": {"features_extractor_kwargs": own}})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("variants:", "variants: [1]\nconf_file:", "variants must be a mapping from names to changes; it is \\[1\\]"),
+        ("seeds: 3", "seeds: [1, x]", "seeds must be a number of trainings, or a list of whole numbers; 'x' is among them"),
+        ("seeds: 3", "seeds: true", "seeds must be a number of trainings"),
+        ("env_steps:", "env_steps: many #", "env_steps must be a whole number; it is 'many'"),
+    ],
+)
+def test_a_sweep_of_other_types_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+    """Lists in place of mappings ended in an AttributeError."""
+    text = "env_steps: 100_000\ntasks: [cartpole-swingup]\nseeds: 3\nvariants:\n  C: {preset: crc}\n"
+    (tmp_path / "sweep.yml").write_text(text, encoding="utf-8")
+    assert len(read_sweep(tmp_path / "sweep.yml")) == 3
+    changed = text.replace(old, new) if old != "variants:" else text[: text.index(old)] + "variants: [1]\n"
+    (tmp_path / "sweep.yml").write_text(changed, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        read_sweep(tmp_path / "sweep.yml")
+
+
 def test_a_path_that_is_no_text_is_refused() -> None:
     """A sweep with ``null:`` among a variant's changes ended in an AttributeError."""
     with pytest.raises(ValueError, match="None is no path"):
