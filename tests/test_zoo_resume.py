@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch as th
 
@@ -113,3 +114,29 @@ def test_a_signal_saves_and_says_how_to_go_on(signum: int, tmp_path: Path) -> No
     resumed = subprocess.run([*go_on, "-n", str(stopped_at + 5)], cwd=ROOT, env=environment(), capture_output=True, text=True)
     assert resumed.returncode == 0, resumed.stderr[-2000:]
     assert (checkpoints / f"{stopped_at + 5:012d}").exists()
+
+
+@pytest.mark.slow
+def test_an_environment_that_dies_is_named_with_the_way_to_go_on(tmp_path: Path) -> None:
+    """Environments are processes of their own; one is killed, and its run is resumed to its end."""
+    flags = ["-n", "400", "--eval-freq", "200", "--eval-episodes", "1", "--verbose", "0", "--checkpoint-every", "40"]
+    flags += ["--vec-env", "subproc", "-params", "overlap:True"]
+    running = subprocess.Popen(
+        command(tmp_path, *flags), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    folder = tmp_path / RUN
+    while not list((folder / CHECKPOINTS).glob("0*/manifest.json")):
+        time.sleep(0.1)
+        assert running.poll() is None
+    for worker in psutil.Process(running.pid).children(recursive=True):
+        if any("forkserver" in part for part in worker.cmdline()) and worker.ppid() != running.pid:
+            worker.kill()
+    said, _ = running.communicate(timeout=60)
+    last = said.strip().splitlines()[-2:]
+    assert running.returncode == 1 and "Traceback" not in said, said
+    assert "environment 0 (process " in last[0] and "was killed by signal 9" in last[0]
+    assert "To go on from the last checkpoint: " in last[1] and f"--resume {folder}" in last[1]
+    resumed = [sys.executable, "train.py", "--resume", str(folder)]
+    done = subprocess.run(resumed, cwd=ROOT, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and (folder / CHECKPOINTS / "DONE").exists(), done.stderr
+    assert CRCSAC.load(folder / MODEL).num_timesteps == 400
