@@ -19,6 +19,7 @@ from sb3_crc.evaluation import QBiasEvalCallback
 from sb3_crc.export import export_policy, load_policy, load_weights
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
+from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
 
 __version__ = version("sb3-crc")
 __all__ = [
@@ -35,6 +36,8 @@ __all__ = [
     "QBiasEvalCallback",
     "ReconstructionImageCallback",
     "TrainingCheckpoint",
+    "WatchedSubprocVecEnv",
+    "WorkerError",
     "export_policy",
     "load_policy",
     "load_weights",
