@@ -82,12 +82,15 @@ class LossHistory:
         update = self.first_update + index
         numpy_state, torch_state = self.draws[index]
         np.random.set_state(numpy_state)
+        rows = np.random.randint(0, buffer.size(), size=batch_size)  # as SB3's buffers draw, and ours
+        places = {"rows": th.from_numpy(rows), "environments": th.from_numpy(np.random.randint(0, buffer.n_envs, rows.shape))}
+        np.random.set_state(numpy_state)
         batch = buffer.sample(batch_size, env=env)
         target = _post_mortem(folder, f"update_{update}")
-        th.save({**_on_host(batch._asdict()), "torch_rng_state": torch_state}, target / "batch.pt")
+        th.save({**_on_host(batch._asdict()), **places, "torch_rng_state": torch_state}, target / "batch.pt")
         raise FloatingPointError(
             f"{name} is {value} at update {update}, agent step {agent_step}: Adam has not stepped on it; go on from the last "
-            f"checkpoint, or with on_nonfinite='skip'; the update's batch is saved in {target}"
+            f"checkpoint, or with on_nonfinite='skip'; the update's batch, with its places in the buffer, is saved in {target}"
         )
 
 

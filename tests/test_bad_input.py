@@ -293,6 +293,8 @@ def test_a_loss_that_is_not_finite_stops_the_training(place: str, term: str, gra
     saved = th.load(folder / "batch.pt", weights_only=True)
     for name in ("observations", "actions", "next_observations", "dones", "rewards"):
         assert th.equal(saved[name], getattr(sampled[0].whole(), name)), name
+    stored = model.replay_buffer.actions[saved["rows"].numpy(), saved["environments"].numpy()]
+    assert np.array_equal(stored, saved["actions"].numpy())
 
 
 class Broken(NoiseEnv):
