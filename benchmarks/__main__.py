@@ -169,23 +169,27 @@ def gpu(
     batch: Annotated[list[int], typer.Option(help="Batch sizes.")] = [512],  # noqa: B006
     method: Annotated[list[str] | None, typer.Option(help="Presets beside stock SAC; default: five.")] = None,
     form: Annotated[list[str] | None, typer.Option(help="How updates are made; default: all four.")] = None,
+    decisions: Annotated[int, typer.Option(min=1, help="Of learn() that are timed.")] = 500,
     output: Annotated[Path, typer.Option(help="Where the JSON file goes.")] = RESULTS.parent / "gpu",
 ) -> None:
-    """CRCSAC.train against stock SB3 SAC on one GPU."""
+    """CRCSAC.train and learn() against stock SB3 SAC on one GPU."""
     import torch as th
 
-    from benchmarks.gpu import FORMS, METHODS, measure
+    from benchmarks.gpu import FORMS, METHODS, end_to_end, measure
 
     if not th.cuda.is_available():
         raise typer.BadParameter("there is no GPU that torch can use; python -m sb3_crc doctor says what there is")
-    rows = []
+    rows, whole = [], []
     with console.status("") as status:
         for network in networks:
             for size in batch:
                 told = lambda done, size=size: status.update(f"batch {size}: {done} of {repeats}")  # noqa: E731
                 own = {"methods": tuple(method or METHODS), "forms": tuple(form or FORMS)}
                 rows += measure(network, size, repeats=repeats, on_round=told, **own)
+                status.update("learn()")
+                whole += end_to_end(network, size, decisions=decisions)
     publish("update", "One update on a GPU", rows, _command(), by=("networks", "batch"), folder=output)
+    publish("end_to_end", "learn() on a GPU", whole, _command(), by=("networks", "batch"), folder=output)
 
 
 @app.command("all")

@@ -1,4 +1,4 @@
-"""One update on a GPU beside one of stock SB3 SAC on the same GPU, and what the memory of each is."""
+"""Updates and whole decisions on a GPU beside those of stock SB3 SAC on the same GPU, and the memory that each takes."""
 
 import statistics
 import time
@@ -7,12 +7,16 @@ from functools import partial
 from typing import Any
 
 import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from benchmarks.end_to_end import TASK
 from benchmarks.flops import operations
 from benchmarks.interleave import Work, in_fresh_process, interleave
 from benchmarks.networks import NETWORKS
 from benchmarks.peers import stock_sac
 from benchmarks.report import Target, judged, spread
+from sb3_crc import WatchedSubprocVecEnv, make_dmc
 
 METHODS = ("crc", "crc_release", "curl", "rad", "drq")
 #: Name -> how updates are made
@@ -70,6 +74,67 @@ def measure(
         targets = TARGETS.get((method, form), []) if setting == ("paper", 512) else []
         rows.append(judged(row, targets))
     return rows
+
+
+#: Of learn(): decisions before those that are timed, with updates, so that everything is recorded
+WARM_UP = 60
+#: Name -> where the environment lives, and how updates are made
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "float32": ("this process", {}),
+    "bfloat16, recorded": ("this process", FORMS["bfloat16, recorded"]),
+    "bfloat16, recorded, overlap": ("its own process", {**FORMS["bfloat16, recorded"], "overlap": True}),
+}
+
+
+def end_to_end(
+    networks: str,
+    batch_size: int,
+    *,
+    decisions: int,
+    methods: tuple[str, ...] = ("crc", "rad"),
+    device: str = "cuda",
+    render_quality: str = "benchmark",
+) -> list[dict[str, Any]]:
+    """
+    :param networks: in :data:`~benchmarks.networks.NETWORKS`
+    :param batch_size: B
+    :param decisions: that are timed, with one update each
+    :param methods: presets; stock SAC comes last
+    :param device: of the networks
+    :param render_quality: of :func:`~sb3_crc.make_dmc`
+    :return: a row per method and way: milliseconds per decision of learn() on cartpole-swingup, and minutes that 12 500 take
+    """
+    rows = []
+    for method, ways in (*((name, tuple(WAYS)) for name in methods), (STOCK, ("float32",))):
+        for way in ways:
+            arguments = (method, way, networks, batch_size, decisions, device, render_quality)
+            milliseconds = 1e3 * in_fresh_process(partial(seconds_per_decision, *arguments))
+            about = {"networks": networks, "batch": batch_size, "method": method, "form": way, "environment in": WAYS[way][0]}
+            rows.append({**about, "ms per decision": milliseconds, "minutes for 12 500": 12_500 * milliseconds / 6e4})
+    return rows
+
+
+def seconds_per_decision(
+    method: str, way: str, networks: str, batch_size: int, decisions: int, device: str, render_quality: str
+) -> float:
+    """:return: of learn(), after random decisions that fill the buffer and :data:`WARM_UP` with updates"""
+    where, settings = WAYS[way]
+    world = NETWORKS[networks]
+    if method == STOCK:
+        model: SAC = stock_sac(world, batch_size, device=device)
+    else:
+        model = world.crc_sac(method, batch_size, device=device, seed=None, **settings)
+    size = world.input_size if method == STOCK else world.frame_size
+    make = partial(make_dmc, TASK, seed=0, image_size=size, render_quality=render_quality)
+    env = WatchedSubprocVecEnv([make]) if where == "its own process" else DummyVecEnv([make])
+    model.set_env(env)
+    model.learn(model.learning_starts + WARM_UP)
+    start = time.perf_counter()
+    model.learn(decisions, reset_num_timesteps=False)
+    finish(None)
+    seconds = time.perf_counter() - start
+    env.close()
+    return seconds / decisions
 
 
 def ours(method: str, form: str, networks: str, batch_size: int, device: str = "cuda") -> Work:

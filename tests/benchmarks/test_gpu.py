@@ -7,7 +7,7 @@ import torch as th
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app
-from benchmarks.gpu import FORMS, UPDATES, matrix_peak, memory_and_operations, ours, stock
+from benchmarks.gpu import FORMS, UPDATES, WAYS, matrix_peak, memory_and_operations, ours, seconds_per_decision, stock
 from benchmarks.update import count
 from benchmarks.update import ours as on_cpu
 
@@ -23,6 +23,12 @@ def test_stock_is_timed_over_as_many_updates() -> None:
     _, needed = memory_and_operations(model)
     assert needed > 0 and UPDATES % 2 == 0
     assert matrix_peak(th.float32, size=64, repeats=3) > 0
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_decision_is_timed_with_its_update(way: str) -> None:
+    seconds = seconds_per_decision("rad", way, "laptop", 8, 4, "cpu", "fast")
+    assert 0.001 < seconds < 10
 
 
 def test_without_a_gpu_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
