@@ -393,4 +393,6 @@ class CRCSAC(BaseCRCSAC):
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
 
     def _step(self, name: str, optimizer: th.optim.Optimizer, gradients: Sequence[th.Tensor | None]) -> dict[str, th.Tensor]:
+        if not gradients:  # joint_update with objectives that have no parameters
+            return {}
         return {f"train/{name}_gradient_norm": checked_step(optimizer, gradients, self.max_grad_norm)}

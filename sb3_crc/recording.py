@@ -93,10 +93,12 @@ class RecordedUpdates:
     def prepare(self) -> None:
         """Let what changes about the optimizers lie on the device."""
         for optimizer in self._optimizers:
-            for group in filter(lambda group: group["params"], optimizer.param_groups):
-                group["capturable"] = group["params"][0].is_cuda
+            parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            device = parameters[0].device if parameters else th.device("cpu")
+            for group in optimizer.param_groups:  # also one without parameters, of an objective that has none
+                group["capturable"] = device.type == "cuda"
                 if not isinstance(group["lr"], th.Tensor):
-                    group["lr"] = th.tensor(group["lr"], device=group["params"][0].device)
+                    group["lr"] = th.tensor(group["lr"], device=device)
             for parameter, state in optimizer.state.items():
                 state["step"] = th.as_tensor(state["step"], device=parameter.device)
 

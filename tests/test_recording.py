@@ -134,6 +134,22 @@ def test_learning_rates_and_weights_reach_what_was_recorded() -> None:
     assert logged["representation/loss"] == pytest.approx(2 * logged["representation/reconstruction"], rel=1e-5)
 
 
+class Plain(AuxiliaryObjective):
+    """Has no parameters."""
+
+    def forward(self, views: Views) -> th.Tensor:
+        return views.query.latent.square().mean()
+
+
+@pytest.mark.parametrize("joint_update", [False, True])
+def test_an_objective_without_parameters_is_recorded(joint_update: bool) -> None:
+    model = recorded(objectives={"tests.test_recording.Plain": 1.0}, joint_update=joint_update)
+    model.train(gradient_steps=9, batch_size=16)
+    optimizer = model.policy.encoder_optimizer
+    assert optimizer is not None and all(isinstance(group["lr"], th.Tensor) for group in optimizer.param_groups)
+    assert ("train/encoder_gradient_norm" in model.logger.name_to_value) is not joint_update
+
+
 class Asks(AuxiliaryObjective):
     """Waits for the device in each update."""
 
