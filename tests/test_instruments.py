@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch as th
 
-from sb3_crc import crc_sac
+from sb3_crc import base_sac
 from sb3_crc.finite import LossHistory
 from sb3_crc.instruments import CollapseAlarm, Speedometer, latent_health, update_ratio
 from tests.conftest import make_model
@@ -58,7 +58,7 @@ def test_speedometer_rates(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_run_logs_its_health(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crc_sac, "HEALTH_INTERVAL", 2)
+    monkeypatch.setattr(base_sac, "HEALTH_INTERVAL", 2)
     model = make_model()
     model.train(gradient_steps=2, batch_size=16)
     logged = model.logger.name_to_value
