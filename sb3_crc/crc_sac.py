@@ -16,7 +16,7 @@ from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory, checked_step, parameters_of
 from sb3_crc.image_spaces import image_shape, image_space
-from sb3_crc.memory import is_out_of_memory, largest_that_fits
+from sb3_crc.memory import largest_that_fits, named_shortage
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
 from sb3_crc.policies import CRCPolicy
 from sb3_crc.presets import PRESETS
@@ -251,16 +251,12 @@ class CRCSAC(BaseCRCSAC):
         self.between_updates()
         self._n_updates += 1
         metrics = history.begin()
-        try:
+        with named_shortage() as shortage:
             views = self._sample_views(batch_size)
             metrics |= self._update(views) if self._recorded is None else self._replayed(views)
-        except (RuntimeError, MemoryError) as error:
-            if not is_out_of_memory(error):
-                raise
-            reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-        else:
-            return
-        raise MemoryError(self._what_fits(batch_size, reason))  # here, where the error holds no tensors any more
+        if shortage:
+            views = None  # type: ignore[assignment]  # gives its memory back
+            raise MemoryError(self._what_fits(batch_size, shortage[0]))
 
     def _update(self, views: Views) -> dict[str, th.Tensor]:
         with self._instruments(views) as health:

@@ -65,6 +65,18 @@ def is_out_of_memory(error: BaseException) -> bool:
     )
 
 
+@contextmanager
+def named_shortage() -> Iterator[list[str]]:
+    """:return: filled, in place of an error, if memory is short: what it said"""
+    said: list[str] = []
+    try:
+        yield said
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        said.append(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}")
+
+
 def largest_that_fits(attempt: Callable[[int], object], size: int) -> int:
     """
     :param attempt: does something with a batch of a size, and raises if memory is short
