@@ -3,6 +3,7 @@
 import io
 import os
 import pathlib
+from abc import abstractmethod
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from inspect import signature
@@ -273,11 +274,13 @@ class BaseCRCSAC(CheckedSAC):
         recorded_weights = self._objective_weights if self._recorded else ()
         self._weight_tensors = {name: th.zeros((), device=self.device) for name in recorded_weights}
 
+    @abstractmethod
     def _make_update(self, history: LossHistory, batch_size: int) -> None:
-        raise NotImplementedError
+        """Draw a batch, and make one update by it."""
 
+    @abstractmethod
     def _update(self, views: Views) -> dict[str, th.Tensor]:
-        raise NotImplementedError
+        """Make one update by the views of a batch. :return: its metrics"""
 
     def _replayed(self, views: Views) -> dict[str, th.Tensor]:
         """:meth:`_update` by a recording, but where instruments look at it, which wait for the device."""

@@ -1,10 +1,11 @@
 """Logs, episodes and evaluations outlive a disk that fails, and tell of it once."""
 
+import csv
 import errno
 import io
-import os
 import shutil
 import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -85,6 +86,12 @@ def callbacks(folder: Path) -> list[Any]:
     return [evaluation, TrainingCheckpoint(folder / "checkpoints", every=20)]
 
 
+def rows_but_times(path: Path) -> list[dict[str, str]]:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return [{name: cell for name, cell in row.items() if name != "t" and not name.startswith("time/")} for row in rows]
+
+
 def test_files_of_a_training_are_the_same_as_ever(tmp_path: Path) -> None:
     """What endures writes what was written before."""
     plain, enduring = tmp_path / "plain", tmp_path / "enduring"
@@ -95,9 +102,8 @@ def test_files_of_a_training_are_the_same_as_ever(tmp_path: Path) -> None:
         model.logger.close()
         model.get_env().close()  # type: ignore[union-attr]
     for name in ("0.monitor.csv", "progress.csv"):
-        rows = [[cell for cell in line.split(",")] for line in (plain / name).read_text(encoding="utf-8").splitlines()]
-        own = [[cell for cell in line.split(",")] for line in (enduring / name).read_text(encoding="utf-8").splitlines()]
-        assert len(rows) == len(own) > 3 and [len(row) for row in rows] == [len(row) for row in own]
+        mine, theirs = (rows_but_times(folder / name) for folder in (enduring, plain))
+        assert mine == theirs and len(mine) >= 3, name
     assert isinstance(model.logger.output_formats[0].file, EnduringFile)  # type: ignore[attr-defined]
 
 
@@ -106,16 +112,15 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 8 MB; where none can be mounted, nothing can be shown."""
     folder = tmp_path / "small"
     folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], check=False, capture_output=True)
-    if mounted.returncode != 0:
-        pytest.skip("no tmpfs can be mounted")
+    command = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(command, check=False, capture_output=True).returncode != 0:
+        pytest.skip("no tmpfs can be mounted; the next test needs none")
     try:
         yield folder
     finally:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-@pytest.mark.skipif(shutil.which("mount") is None or not hasattr(os, "geteuid"), reason="no mount")
 def test_a_training_on_a_full_disk_comes_to_its_end(small_disk: Path, tmp_path: Path) -> None:
     (small_disk / "ballast").write_bytes(bytes(8_200_000))
     model = model_in(small_disk)
@@ -131,6 +136,27 @@ def test_a_training_on_a_full_disk_comes_to_its_end(small_disk: Path, tmp_path: 
         model.learn(40, callback=callbacks(small_disk)[1:], reset_num_timesteps=False)
     assert CheckpointStore(small_disk / "checkpoints").names()
     assert (small_disk / "0.monitor.csv").stat().st_size > 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no files")
+def test_files_that_may_not_grow_are_outlived(tmp_path: Path) -> None:
+    """The kernel's own limit, which needs no mount."""
+    import resource
+
+    model = model_in(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.warns(UserWarning, match="File too large") as told:
+            model.learn(80, callback=callbacks(tmp_path), log_interval=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert model.num_timesteps == 80 and model._n_updates == 60
+    messages = " ".join(str(one.message) for one in told)
+    for what in ("the checkpoint of", "the best model in", "of this training could not be written"):
+        assert what in messages, messages
+    model.learn(40, callback=callbacks(tmp_path)[1:], reset_num_timesteps=False)
+    assert CheckpointStore(tmp_path / "checkpoints").names()
 
 
 def test_a_folder_that_becomes_read_only_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
