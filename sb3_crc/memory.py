@@ -87,12 +87,9 @@ def largest_that_fits(attempt: Callable[[int], object], size: int) -> int:
         gc.collect()
         if th.cuda.is_available():
             th.cuda.empty_cache()
-        try:
+        with named_shortage() as shortage:
             attempt(size)
-        except (RuntimeError, MemoryError) as error:
-            if not is_out_of_memory(error):
-                raise
-        else:
+        if not shortage:
             return size
     return 0
 
