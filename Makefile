@@ -80,5 +80,5 @@ $(STAMP):
 	if [ "$$(uname -sm)" = "Linux x86_64" ] && ! nvidia-smi >/dev/null 2>&1 && timeout 3 .venv/bin/python -c \
 	  'from urllib.request import urlopen; urlopen("$(TORCH_CPU_INDEX)/torch/", timeout=3)' >/dev/null 2>&1; \
 	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
-	exec .venv/bin/python -m pip install --disable-pip-version-check $$index -c constraints.txt -e '.[zoo,video,track,analysis,cluster,onnx,bench,dev]'
+	exec .venv/bin/python -m pip install --disable-pip-version-check $$index -c constraints.txt -e '.[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]'
 	@touch $@

@@ -87,7 +87,7 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path)
 
 
-INSTALL = "-m pip install --disable-pip-version-check -c constraints.txt -e .[zoo,video,track,analysis,cluster,onnx,bench,dev]"
+INSTALL = "-m pip install --disable-pip-version-check -c constraints.txt -e .[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]"
 RENDERING = "-m sb3_crc rendering --install"
 FAST_TESTS = "-m pytest -n 2 -m not slow and not long"
 
