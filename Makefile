@@ -51,7 +51,9 @@ lint: $(STAMP) ## style, types, import contracts, docstrings
 	.venv/bin/lint-imports
 	.venv/bin/interrogate sb3_crc
 
-constraints: $(STAMP) ## solve the exact versions anew
+constraints: ## solve the exact versions anew
+	$(VENV)
+	@test -x .venv/bin/uv || .venv/bin/python -m pip install --disable-pip-version-check uv
 	.venv/bin/uv pip compile --universal --python-version 3.10 --all-extras pyproject.toml \
 	  --custom-compile-command "make constraints" -o constraints.txt
 
@@ -67,15 +69,19 @@ install: $(STAMP) ## the virtual environment alone
 rendering: $(STAMP)
 	@.venv/bin/python -m sb3_crc rendering --install
 
-# The stamp's name holds a checksum of what was installed, and it is written last: an interrupted installation has none.
-# On Linux x86-64 without a GPU the PyTorch index saves about 3 GB of CUDA libraries, if it answers within 3 seconds.
-$(STAMP):
-	@rm -f .venv/.installed-*
-	@.venv/bin/python -m pip --version >/dev/null 2>&1 || { \
+define VENV
+@.venv/bin/python -m pip --version >/dev/null 2>&1 || { \
 	  for python in $(or $(strip $(PYTHON)),python3 python3.12 python3.11 python3.10); do \
 	    if "$$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' >/dev/null 2>&1; then \
 	      echo "making .venv with $$python"; exec "$$python" -m venv --clear .venv; fi; \
 	  done; echo "No Python 3.10 to 3.12 found: install one, or say make PYTHON=/path/to/python." >&2; exit 1; }
+endef
+
+# The stamp's name holds a checksum of what was installed, and it is written last: an interrupted installation has none.
+# On Linux x86-64 without a GPU the PyTorch index saves about 3 GB of CUDA libraries, if it answers within 3 seconds.
+$(STAMP):
+	@rm -f .venv/.installed-*
+	$(VENV)
 	@index=; \
 	if [ "$$(uname -sm)" = "Linux x86_64" ] && ! nvidia-smi >/dev/null 2>&1 && timeout 3 .venv/bin/python -c \
 	  'from urllib.request import urlopen; urlopen("$(TORCH_CPU_INDEX)/torch/", timeout=3)' >/dev/null 2>&1; \
