@@ -76,6 +76,11 @@ def plot(command: str, flags: Flags) -> None:
             _run(command, flags, script)
 
 
+def hub(command: str, flags: Flags) -> None:
+    """Run one of the commands of :mod:`sb3_crc.zoo.hub`, which alone needs Hugging Face's packages."""
+    getattr(importlib.import_module("sb3_crc.zoo.hub"), command)(f"{PROGRAM} {command}", flags)
+
+
 COMMANDS: dict[str, tuple[Callable[[Flags], None], str]] = {
     "train": (lambda flags: _run("train", flags, train), "train, go on with -i, or search with -optimize"),
     "enjoy": (enjoy, "run a trained policy and print its returns"),
@@ -83,6 +88,8 @@ COMMANDS: dict[str, tuple[Callable[[Flags], None], str]] = {
     "plot_train": (partial(plot, "plot_train"), "returns of the training episodes"),
     "all_plots": (partial(plot, "all_plots"), "learning curves of several runs, and a table"),
     "plot_from_file": (partial(plot, "plot_from_file"), "more plots of all_plots' file; -r: rliable"),
+    "push_to_hub": (partial(hub, "push_to_hub"), "share a policy on the Hugging Face Hub"),
+    "load_from_hub": (partial(hub, "load_from_hub"), "make a run of what was shared there"),
 }
 
 
