@@ -40,6 +40,15 @@ def make_reacher(seed: int) -> gym.Env[Observation, np.ndarray]:
     return gym.wrappers.FilterObservation(env, ["pixels", "position", "velocity"])
 
 
+def moment(seed: int) -> Observation:
+    """Of an episode of its own, with the ball where no other moment has it, and joints that move."""
+    env = make_reacher(seed)
+    env.reset()
+    for _ in range(5):
+        observation, *_ = env.step(env.action_space.sample())
+    return observation
+
+
 def dependence(model: CRCSAC, observations: list[Observation]) -> dict[str, float]:
     """How much the mean action changes when a part of the observation is taken from another moment, by the part's name."""
 
@@ -68,9 +77,7 @@ def main() -> None:
     print(f"heads see {heads} numbers: a latent of {latent} and {heads - latent} of proprioception")
     model.learn(given.steps)
 
-    # Moments of different episodes, so that the ball is elsewhere
-    moments = [make_reacher(seed).reset()[0] for seed in range(8)]
-    for name, change in dependence(model, moments).items():
+    for name, change in dependence(model, [moment(seed) for seed in range(8)]).items():
         print(f"with {name} of another moment the mean action changes by {change:.3f}")
 
 
