@@ -1,9 +1,13 @@
 """Environments in processes of their own, which are watched: one that has died or hangs is named, and may be replaced."""
 
+import atexit
+import math
 import multiprocessing
-import time
+import signal
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +18,17 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs, _worker
 
 #: Seconds in which an environment must answer
 TIMEOUT = 300.0
+
+#: Seconds that a new process has at least, since it must first import what it needs
+START = 120.0
+
+#: Seconds after which somebody who waits looks again
+PAUSE = 0.5
+
+#: Reach each process of a terminal or of a job. They are for the training, which answers them with the environments' states
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+Make = Callable[[], gym.Env[Any, Any]]
 
 
 class WorkerError(RuntimeError):
@@ -31,18 +46,19 @@ class WorkerError(RuntimeError):
 
 class WatchedSubprocVecEnv(SubprocVecEnv):
     """
-    SB3's SubprocVecEnv, which would wait for ever for a process that hangs, and names none that has died.
+    SB3's SubprocVecEnv, which would wait for ever for a process that hangs, names none that has died, and whose processes end
+    with Ctrl-C before the training can save their states.
 
     :param env_fns: make the environments
     :param start_method: as in SB3
-    :param timeout: seconds in which each must answer
+    :param timeout: seconds in which each must answer; those in which this process itself is stopped do not count
     :param restart: replace one that has died or hangs in a step by a new one: its episode ends there, truncated, and the next
         one begins by another seed. Otherwise, and outside of steps, a :class:`WorkerError` names it
     """
 
     def __init__(
         self,
-        env_fns: list[Callable[[], gym.Env[Any, Any]]],
+        env_fns: list[Make],
         start_method: str | None = None,
         *,
         timeout: float = TIMEOUT,
@@ -52,15 +68,18 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.restart = restart
         #: How often one was replaced
         self.restarts = 0
-        self._env_fns = env_fns
+        self._env_fns: list[Make] = [partial(_undisturbed, make) for make in env_fns]
         self._last: list[Any] = [None] * len(env_fns)
-        super().__init__(env_fns, start_method)
+        super().__init__(self._env_fns, start_method)
         methods = multiprocessing.get_all_start_methods()
         self._start_method = start_method or ("forkserver" if "forkserver" in methods else "spawn")
         self.remotes = tuple(
             _WatchedPipe(remote, process, index, timeout)
             for index, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True))
         )
+        # Before multiprocessing waits for processes that nobody has told to end
+        self._at_exit = partial(_close, weakref.ref(self))
+        atexit.register(self._at_exit)
 
     def step_async(self, actions: np.ndarray) -> None:
         """:param actions: ``(N, A)``"""
@@ -109,6 +128,7 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
                 process.join()
             remote.close()
         self.closed = True
+        atexit.unregister(self._at_exit)
 
     def _replaced(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
         """:return: the end of the lost episode, as a worker tells of one"""
@@ -126,9 +146,22 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.processes[index] = process
         self.remotes = (*self.remotes[:index], watched, *self.remotes[index + 1 :])
         watched.send(("reset", (1_000_003 * self.restarts + index, None)))
-        observation, reset_info = watched.recv()
+        observation, reset_info = watched.recv(max(self.timeout, START))
         info = {"TimeLimit.truncated": True, "terminal_observation": self._last[index], "restarted": True}
         return observation, 0.0, True, info, reset_info
+
+
+def _undisturbed(make: Make) -> gym.Env[Any, Any]:
+    """:return: the environment, in a process that signals do not end; it ends with the pipe to the training"""
+    for signum in SIGNALS:
+        signal.signal(signum, signal.SIG_IGN)
+    return make()
+
+
+def _close(reference: "weakref.ref[WatchedSubprocVecEnv]") -> None:
+    env = reference()
+    if env is not None:
+        env.close()
 
 
 class _WatchedPipe:
@@ -153,21 +186,19 @@ class _WatchedPipe:
         with suppress(OSError):  # told of when its answer is awaited
             self._pipe.send(message)
 
-    def recv(self) -> Any:
-        deadline = time.monotonic() + self._timeout
+    def recv(self, timeout: float | None = None) -> Any:
+        timeout = timeout or self._timeout
         try:
-            while not self._pipe.poll(0.5):
-                if not self._process.is_alive() and not self._pipe.poll(0):
-                    raise self._dead()
-                if time.monotonic() > deadline:
-                    raise WorkerError(
-                        self._index,
-                        f"environment {self._index} (process {self._process.pid}) has not answered {self._asked!r} within "
-                        f"{self._timeout:g} s: it hangs",
-                    )
-            return self._pipe.recv()
+            for _ in range(math.ceil(timeout / PAUSE)):
+                if self._pipe.poll(PAUSE):
+                    return self._pipe.recv()
         except (EOFError, ConnectionError):
             raise self._dead() from None
+        raise WorkerError(
+            self._index,
+            f"environment {self._index} (process {self._process.pid}) has not answered {self._asked!r} within "
+            f"{timeout:g} s: it hangs",
+        )
 
     def close(self) -> None:
         self._pipe.close()

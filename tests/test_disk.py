@@ -8,11 +8,13 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -27,42 +29,75 @@ from tests.conftest import POLICY_KWARGS, NoiseEnv
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
-class Disk(io.StringIO):
-    """A file on a disk that can be full."""
+class FullDisk(io.FileIO):
+    """Takes three more bytes."""
 
-    name = "log.csv"
-    full = False
-
-    def flush(self) -> None:
-        if self.full:
-            raise FULL
-        super().flush()
+    def write(self, data: Any) -> int:
+        super().write(data[:3])
+        raise FULL
 
 
-def test_a_file_tells_once_until_it_can_be_written_again() -> None:
-    disk = Disk()
-    file = EnduringFile(disk)
-    told = []
+def written(file: EnduringFile) -> list[str]:
+    """:return: what the user is told while the file is brought to the disk"""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        file.flush()
+    return [str(one.message) for one in caught]
+
+
+def test_a_file_tells_once_until_it_can_be_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "log.csv"
+    file = EnduringFile(path.open("w"))
+    told, on_disk = [], []
     for full in (False, True, True, False, True):
-        disk.full = full
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            file.write("x")
-            file.flush()
-        told.append([str(one.message) for one in caught])
-    message = "log.csv could not be written: [Errno 28] No space left on device. Training goes on"
-    assert told == [[], [message], [], [], [message]]
-    disk.full = False
-    assert file.getvalue() == "xxxxx" and file.name == "log.csv"
+        if full:
+            monkeypatch.setattr("sb3_crc.disk.open", lambda path, *_, **__: FullDisk(path, "r+b"), raising=False)
+        else:
+            monkeypatch.undo()
+        file.write("a line\n")
+        told.append(written(file))
+        on_disk.append(path.read_text().count("a line\n"))
+        assert path.read_text() == "a line\n" * on_disk[-1], "half a line"
+    message = f"{path} could not be written: [Errno 28] No space left on device. Training goes on"
+    assert told == [[], [message], [], [], [message]] and on_disk == [1, 1, 1, 4, 4]
+    monkeypatch.undo()
+    assert file.contents() == "a line\n" * 5
+    file.close()
+    assert path.read_text() == "a line\n" * 5
 
 
-def test_errors_that_are_not_the_disks_are_raised() -> None:
+def test_a_file_whose_head_changes_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As SB3's CSV does for a new column, on a disk that fails at that moment."""
+    path = tmp_path / "log.csv"
+    path.write_text("a\n1\n")
+    file = EnduringFile(path.open("r+"))
+
+    def fail(*paths: Any) -> None:
+        raise FULL
+
+    monkeypatch.setattr("sb3_crc.atomic.os.replace", fail)
+    file.seek(0)
+    rows = file.readlines()
+    file.seek(0)
+    for text in ("a,b\n", rows[1].strip() + ",\n", "2,3\n"):
+        file.write(text)
+    assert len(written(file)) == 1 and path.read_text() == "a\n1\n"
+    file.write("4,5\n")
+    monkeypatch.undo()
+    assert written(file) == [] and path.read_text() == "a,b\n1,\n2,3\n4,5\n"
+    file.write("6,7\n")
+    file.flush()
+    assert path.read_text() == "a,b\n1,\n2,3\n4,5\n6,7\n" and [one.name for one in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_errors_that_are_not_the_disks_are_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BrokenPipeError), outlived("a file"):
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
-    disk = Disk()
-    disk.flush = lambda: (_ for _ in ()).throw(ConnectionResetError(errno.ECONNRESET, "reset"))  # type: ignore[method-assign]
-    with pytest.raises(ConnectionResetError):
-        EnduringFile(disk).flush()
+    file = EnduringFile((tmp_path / "log.csv").open("w"))
+    file.write("a line\n")
+    with monkeypatch.context() as broken, pytest.raises(ConnectionResetError):
+        broken.setattr(file, "_append", lambda more: (_ for _ in ()).throw(ConnectionResetError(errno.ECONNRESET, "reset")))
+        file.flush()
 
 
 def model_in(folder: Path) -> CRCSAC:
@@ -70,7 +105,7 @@ def model_in(folder: Path) -> CRCSAC:
     model = CRCSAC(
         "CnnPolicy", env, batch_size=8, buffer_size=100, learning_starts=20, policy_kwargs=POLICY_KWARGS, seed=0, device="cpu"
     )
-    model.set_logger(configure(str(folder), ["csv", "json", "log"]))
+    model.set_logger(configure(str(folder), ["csv", "json", "log", "tensorboard"]))
     return model
 
 
@@ -121,15 +156,32 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
+class Filling(BaseCallback):
+    """Leaves nothing of the disk from the first decision on."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path = path
+
+    def _on_rollout_start(self) -> None:
+        if not self.path.exists():
+            with self.path.open("wb", buffering=0) as file, suppress(OSError):
+                while True:
+                    file.write(bytes(4096))
+
+    def _on_step(self) -> bool:
+        return True
+
+
 def test_a_training_on_a_full_disk_comes_to_its_end(small_disk: Path, tmp_path: Path) -> None:
-    (small_disk / "ballast").write_bytes(bytes(8_200_000))
     model = model_in(small_disk)
     with pytest.warns(UserWarning, match="Training goes on") as told:
-        model.learn(80, callback=callbacks(small_disk), log_interval=1)
+        model.learn(80, callback=[Filling(small_disk / "ballast"), *callbacks(small_disk)], log_interval=1)
     assert model.num_timesteps == 80 and model._n_updates == 60
     messages = " ".join(str(one.message) for one in told)
-    for what in ("the checkpoint of", "the best model in", "of this training could not be written"):
+    for what in ("the checkpoint of", "the best model in", "TensorBoard's events", "of this training could not be written"):
         assert what in messages, messages
+    assert len(rows_but_times(small_disk / "progress.csv")) == 0
     (small_disk / "ballast").unlink()
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -94,7 +94,7 @@ class TrainingCheckpoint(BaseCallback):
     def _on_training_start(self) -> None:
         self._writer = ThreadPoolExecutor(1, "checkpoint")
         self._failures = 0
-        endure(self.logger, self.training_env)
+        endure(self.logger, self.training_env, self.monitor_dir)
         self._request = StopRequest()
         self._request.listen()
         if hasattr(self.model, "between_updates"):  # an attribute that a stock algorithm does not know would be saved with it

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium as gym
-from stable_baselines3.common.logger import CSVOutputFormat, JSONOutputFormat, Logger
+from stable_baselines3.common.logger import CSVOutputFormat, JSONOutputFormat, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
 from sb3_crc.checkpoints.tree import Tree, copied, is_plain
-from sb3_crc.disk import EnduringFile
+from sb3_crc.disk import EnduringEvents, EnduringFile
 
 
 def log_state(logger: Logger, env: VecEnv) -> Tree:
@@ -56,14 +56,17 @@ def set_log_state(logger: Logger, env: VecEnv, state: Tree) -> None:
         monitor.t_start = time.time() - seconds
 
 
-def endure(logger: Logger, env: VecEnv) -> None:
+def endure(logger: Logger, env: VecEnv, folder: Path | None) -> None:
     """
-    Let the log's files and Monitor's, of environments in this process, outlive a disk that fails. TensorBoard's do not.
+    Let the log's files and Monitor's outlive a disk that fails.
 
     :param logger: of the model
     :param env: of the training
+    :param folder: of Monitor's files where the environments live in other processes, see :func:`distant_monitors`
     """
-    for format_ in logger.output_formats:
+    for place, format_ in enumerate(logger.output_formats):
+        if isinstance(format_, TensorBoardOutputFormat):
+            logger.output_formats[place] = EnduringEvents(format_)
         file = getattr(format_, "file", None)
         if isinstance(getattr(file, "name", None), str) and file not in (sys.stdout, sys.stderr):
             format_.file = _enduring(file)  # type: ignore[attr-defined]
@@ -71,6 +74,7 @@ def endure(logger: Logger, env: VecEnv) -> None:
         results = monitor.results_writer
         results.file_handler = _enduring(results.file_handler)
         results.logger.writer = csv_writer(results.file_handler)
+    set_distant_monitors(env, folder, distant_monitors(env, folder))
 
 
 def _enduring(file: Any) -> EnduringFile:
@@ -111,7 +115,7 @@ def set_distant_monitors(env: VecEnv, folder: Path | None, state: Tree) -> None:
 
 class ContinuedResults(ResultsWriter):
     """
-    Goes on with a file of Monitor's; it is opened in the process to which this is sent.
+    Goes on with a file of Monitor's, also when its disk fails; it is opened in the process to which this is sent.
 
     :param path: of the file
     :param text: what it has held so far
@@ -126,9 +130,10 @@ class ContinuedResults(ResultsWriter):
 
 def _opened(path: Path, text: str) -> ContinuedResults:
     writer = ContinuedResults(path, text)
-    writer.file_handler = path.open("w", encoding="utf-8", newline="\n")
-    writer.logger = DictWriter(writer.file_handler, DictReader(StringIO(text.partition("\n")[2])).fieldnames or [])
-    _write(writer.file_handler, text)
+    file: Any = _enduring(path.open("a", encoding="utf-8"))
+    writer.file_handler = file
+    writer.logger = DictWriter(file, DictReader(StringIO(text.partition("\n")[2])).fieldnames or [])
+    _write(file, text)
     return writer
 
 
@@ -150,12 +155,14 @@ def _monitors(env: VecEnv) -> Iterator[Any]:
             wrapper = wrapper.env
 
 
-def _read(file: TextIO) -> str:
+def _read(file: TextIO | EnduringFile) -> str:
+    if isinstance(file, EnduringFile):
+        return file.contents()
     file.flush()
     return Path(file.name).read_text(encoding="utf-8")
 
 
-def _write(file: TextIO, text: str) -> None:
+def _write(file: TextIO | EnduringFile, text: str) -> None:
     file.seek(0)
     file.truncate()
     file.write(text)

@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import multiprocessing
 import os
 import runpy
 import sys
@@ -17,6 +18,7 @@ from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
+from sb3_crc.workers import WorkerError
 from sb3_crc.zoo.algorithms import preset_class, register, watched
 from sb3_crc.zoo.figures import figures, normalized_inputs, split_figures_flag
 from sb3_crc.zoo.manager import CRCExperimentManager
@@ -26,10 +28,14 @@ from sb3_crc.zoo.resume import read_plan
 PROGRAM = "python -m sb3_crc.zoo"
 Flags = list[str]
 
+#: What processes of environments need, imported once for all of them
+WORKERS_IMPORT = ["sb3_crc", "sb3_crc.envs.simulator", "stable_baselines3.common.env_util"]
+
 
 def train() -> None:
     """Run rl_zoo3's training script on ``sys.argv``."""
     logging.basicConfig(format="%(message)s")
+    multiprocessing.set_forkserver_preload(WORKERS_IMPORT)
     register()
     program, *flags = sys.argv
     plan = CRCExperimentManager.plan = read_plan(flags)
@@ -39,6 +45,8 @@ def train() -> None:
     except KeyboardInterrupt:
         say("Interrupted before or after training: what is in the run's folder is complete, nothing else was written.")
         sys.exit(130)
+    except WorkerError as error:  # while environments are made
+        sys.exit(str(error))
     if CRCExperimentManager.stopped_by is not None:
         sys.exit(128 + CRCExperimentManager.stopped_by)
 
