@@ -1,39 +1,77 @@
 """The command line, ``sb3-crc`` or ``python -m sb3_crc``: what works here, measurements, comparisons, analyses.
 
-Training is ``train.py``.
+Training is ``train.py``. Modules that take long to import are imported by the commands that need them.
 """
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
+from sb3_crc import completion
 from sb3_crc.analysis.commands import app as analysis
-from sb3_crc.console import console, errors, in_one_line, say
+from sb3_crc.command import Group, No, Program, command
+from sb3_crc.console import errors, say, show, tell
 from sb3_crc.experiments.commands import app as experiments
+from sb3_crc.experiments.hub_command import app as hub
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="CRC-RL for Stable-Baselines3.")
+if TYPE_CHECKING:
+    from sb3_crc.doctor import Finding
+
+HELP = """\
+CRC-RL for Stable-Baselines3: SAC from pixels with contrastive, reconstruction and consistency losses.
+
+Begin with `sb3-crc doctor`, then `make train`, which two processor cores can do, or, with a GPU and the paper's settings,
+
+\b
+  python train.py --algo crc --env dmc_pixels/cartpole-swingup-v0
+
+and look at it with `sb3-crc report logs`. The help of each command ends with an example."""
+EPILOG = """\
+Every command takes --json: one JSON document on stdout, all else on stderr.
+
+Exit codes: 0 fine; 1 the answer is no, or work failed; 2 wrong usage or input; 130 Ctrl-C; 143 SIGTERM.
+
+README.md and docs/command_line.md say more."""
+
+app = typer.Typer(cls=Program, no_args_is_help=True, help=HELP, epilog=EPILOG, pretty_exceptions_enable=False)
 app.add_typer(experiments)
 app.add_typer(analysis)
+app.add_typer(hub)
 
 MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "broken": "[red]broken[/]"}
 
 
-@app.command()
-def doctor() -> None:
+def _version(wanted: bool) -> None:
+    if wanted:
+        from sb3_crc import __version__
+
+        say(f"sb3-crc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """See :data:`HELP`."""
+
+
+@command(app, Group.MACHINE, "sb3-crc doctor", "sb3-crc doctor --json > machine.json")
+def doctor() -> object:
     """Show what works on this machine; exit code 1 if something essential does not."""
-    from sb3_crc.doctor import Finding, examine
+    from rich.markup import escape
+    from rich.table import Table
+
+    from sb3_crc.doctor import examine
 
     table = Table(title="sb3_crc doctor", title_justify="left")
     for column in ("", "", "found", ""):
         table.add_column(column, overflow="fold")
     findings: list[Finding] = []
-    with console.status("drawing a few frames"):
+    with errors.status("drawing a few frames"):
         for finding in examine():
             begins = not findings or findings[-1].topic != finding.topic
             if begins and findings:
@@ -41,20 +79,56 @@ def doctor() -> None:
             topic = finding.topic if begins else ""
             table.add_row(topic, finding.name, escape(finding.value), MARKS[finding.verdict])
             findings.append(finding)
-    console.print(table)
+    show(table)
     broken = [finding for finding in findings if finding.verdict == "broken"]
     for finding in broken:  # once more outside the table, where a command that is to be copied stays on one line
-        say(f"{finding.name}: {finding.value}", errors)
-    if broken:
-        raise typer.Exit(1)
+        tell(f"{finding.name}: {finding.value}")
+    document = {"works": not broken, "findings": findings}
+    return No(document) if broken else document
 
 
-@app.command()
-@in_one_line
+@command(app, Group.MACHINE, "sb3-crc rendering")
+def rendering(
+    install: Annotated[
+        bool,
+        typer.Option("--install", help="Install the missing system library as root in a container, or if AUTO_APT=1 or CI=1."),
+    ] = False,
+) -> object:
+    """Print the OpenGL back end that draws without a display; exit code 1 and what mends it if there is none."""
+    from sb3_crc.envs.rendering import RenderingUnavailable, install_system_library, prove_backend
+
+    try:
+        try:
+            outcome = prove_backend()
+        except RenderingUnavailable:
+            if not install:
+                raise
+            install_system_library()
+            outcome = prove_backend()
+    except RenderingUnavailable as error:
+        tell(str(error))
+        return No({"backend": None, "renderer": None, "reason": str(error)})
+    say(f"pictures are drawn by {outcome.backend}: {outcome.renderer}")
+    return {"backend": outcome.backend, "renderer": outcome.renderer, "reason": None}
+
+
+@command(
+    app,
+    Group.SHARE,
+    "sb3-crc export logs/crc/dmc_pixels-cartpole-swingup-v0_1 policy.sb3crc",
+    "sb3-crc export logs/crc/dmc_pixels-cartpole-swingup-v0_1 policy.onnx",
+)
 def export(
-    source: Annotated[Path, typer.Argument(help="run of train.py whose training has ended, or zip that CRCSAC has saved")],
-    output: Annotated[Path, typer.Argument(help="policy.sb3crc, or a program for other runtimes: policy.onnx, policy.pt2")],
-) -> None:
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="Run of train.py whose training has ended, or zip that CRCSAC has saved.", autocompletion=completion.runs
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Argument(help="File to write: policy.sb3crc, or a program for other runtimes: policy.onnx, policy.pt2.")
+    ],
+) -> object:
     """Write a policy as safetensors and JSON, which can be read without trust; the zip that it comes from cannot."""
     from sb3_crc import CRCSAC
     from sb3_crc.experiments.runs import Run
@@ -73,17 +147,22 @@ def export(
     program = output.suffix in (ONNX, TORCH)
     written = export_program(model, output) if program else export_policy(model, output, **about)
     say(f"{written}: {written.stat().st_size / 1e6:.1f} MB")
+    return {"file": written, "bytes": written.stat().st_size}
 
 
-@app.command()
-@in_one_line
+@command(
+    app,
+    Group.SHARE,
+    "sb3-crc enjoy results/laptop/cartpole-swingup/policy.sb3crc",
+    "sb3-crc enjoy policy.sb3crc --film policy.mp4",
+)
 def enjoy(
-    policy: Annotated[Path, typer.Argument(help="file of `sb3-crc export`, of anyone")],
-    task: Annotated[str | None, typer.Option(help="domain-task, if the file does not say")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="how many")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="of the environment")] = 0,
-    film: Annotated[Path | None, typer.Option(help="mp4 file to write, of one more episode")] = None,
-) -> None:
+    policy: Annotated[Path, typer.Argument(help="File of `sb3-crc export`, of anyone.")],
+    task: Annotated[str | None, typer.Option(help="domain-task; else the file's.", autocompletion=completion.tasks)] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the environment.")] = 0,
+    film: Annotated[Path | None, typer.Option(help="mp4 file to write, of one more episode; else none.")] = None,
+) -> object:
     """Let an exported policy act by its mean action: print its returns, film it."""
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
@@ -99,140 +178,9 @@ def enjoy(
     assert isinstance(returns, list)
     for episode, value in enumerate(returns):
         say(f"{found}, episode {episode}: {value:.1f}")
+    document: dict[str, Any] = {"task": found, "seed": seed, "returns": returns, "film": film, "film_return": None}
     if film is not None:
-        say(f"{film}: {record(acting, env, film):.1f}")
+        document["film_return"] = record(acting, env, film)
+        say(f"{film}: {document['film_return']:.1f}")
     env.close()
-
-
-@app.command()
-def rendering(
-    install: Annotated[
-        bool,
-        typer.Option("--install", help="Install the missing system library as root in a container, or if AUTO_APT=1 or CI=1."),
-    ] = False,
-) -> None:
-    """Print the OpenGL back end that draws without a display; exit code 2 and what mends it if there is none."""
-    from sb3_crc.envs.rendering import RenderingUnavailable, install_system_library, prove_backend
-
-    try:
-        try:
-            outcome = prove_backend()
-        except RenderingUnavailable:
-            if not install:
-                raise
-            install_system_library()
-            outcome = prove_backend()
-    except RenderingUnavailable as error:
-        say(str(error), errors)
-        raise typer.Exit(2) from None
-    say(f"pictures are drawn by {outcome.backend}: {outcome.renderer}")
-
-
-@app.command()
-def baselines(
-    task: Annotated[str, typer.Argument(help="domain-task, for instance cartpole-swingup")],
-    output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
-    episodes: Annotated[int, typer.Option(min=2, help="of each policy")] = 20,
-    action_repeat: Annotated[int | None, typer.Option(min=1, help="the task's own if not given")] = None,
-    seed: int = 0,
-) -> None:
-    """Measure the returns of the random and of the zero policy."""
-    from sb3_crc.experiments.baselines import measure_baselines
-
-    measured = measure_baselines(task, episodes=episodes, action_repeat=action_repeat, seed=seed)
-    _show(measured, output)
-
-
-@app.command()
-def ladder(
-    rung: Annotated[
-        str,
-        typer.Argument(
-            help="state: SAC from states; seen: SAC from positions as an encoder could see them; probe: an untrained encoder; "
-            "teach: a taught one; overfit: each loss"
-        ),
-    ],
-    task: Annotated[str, typer.Argument(help="domain-task")] = "cartpole-swingup",
-    output: Annotated[Path | None, typer.Option(help="JSON file to write; else the result is printed")] = None,
-    config: Annotated[Path, typer.Option(help="rl-zoo file whose policy_kwargs are used")] = Path("zoo_configs/laptop.yml"),
-    reward_scale: Annotated[float, typer.Option(help="factor on the rewards, rung state")] = 1.0,
-    error: Annotated[list[float] | None, typer.Option(help="of what is read off a frame, in metres, rung seen")] = None,
-    n_steps: Annotated[list[int] | None, typer.Option(help="of the returns, rung seen")] = None,
-    target_entropy: Annotated[float, typer.Option(help="of the policy, rung seen")] = -1.0,
-    falling_rates: Annotated[bool, typer.Option("--falling-rates", help="learning rates that end at 0, rung seen")] = False,
-    agent_steps: Annotated[int, typer.Option(min=600, help="of each training, rung seen")] = 7_500,
-    evaluations: Annotated[int, typer.Option(min=1, help="of each training, rung seen")] = 6,
-    seed: int = 0,
-) -> None:
-    """Measure what must work before learning from pixels can."""
-    import yaml
-
-    from sb3_crc.experiments import ladder as rungs
-
-    policy_kwargs = yaml.safe_load(config.read_text())["default"]["policy_kwargs"]
-    if rung == "state":
-        measured: object = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
-    elif rung == "seen":
-        shared: dict[str, Any] = {"target_entropy": target_entropy, "falling_rates": falling_rates}
-        shared |= {"agent_steps": agent_steps, "evaluations": evaluations, "seed": seed}
-        measured = [
-            rungs.seen_state_sac(task, error=one, n_steps=steps, **shared)
-            for one in error or [0.0]
-            for steps in n_steps or [1]
-        ]
-    elif rung == "probe":
-        measured = rungs.probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
-    elif rung == "teach":
-        measured = rungs.teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
-    elif rung == "overfit":
-        measured = [
-            rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed)
-            for name, own in rungs.OVERFITTED
-        ]
-    else:
-        raise typer.BadParameter(f"{rung!r} is none of state, seen, probe, teach, overfit")
-    _show(measured, output)
-
-
-@app.command()
-def trials(
-    runs: Annotated[list[Path], typer.Argument(help="folders of runs, <logs>/<algo>/<env>_<number>")],
-    output: Annotated[Path, typer.Option(help="CSV file to write into")] = Path("trials.csv"),
-    episodes: Annotated[int, typer.Option(min=0, help="fresh ones for the final policy of each finished run")] = 10,
-    note: Annotated[str, typer.Option(help="why it was tried, or why it was stopped")] = "",
-) -> None:
-    """Write runs into a table of trials: settings, curve, final return, time."""
-    from sb3_crc.experiments.trials import record_trials
-
-    for row in record_trials(runs, output, episodes=episodes, note=note):
-        say(f"{row['trial']}: {row.get('final_mean', 'not finished')}")
-
-
-@app.command()
-def curve(
-    runs: Annotated[list[Path], typer.Argument(help="folders of runs, <method>/<run>, each with its evaluations.npz")],
-    output: Annotated[Path, typer.Option(help="picture to write")] = Path("learning_curve.png"),
-    action_repeat: Annotated[int, typer.Option(min=1, help="environment steps per agent step of that run")] = 1,
-    baselines: Annotated[Path | None, typer.Option(help="JSON of `baselines`, drawn as lines")] = None,
-    title: str = "",
-) -> None:
-    """Draw the learning curve of a run, or those of several methods and seeds, beside policies that have learned nothing."""
-    from sb3_crc.experiments.curves import plot_learning_curve, plot_learning_curves
-
-    measured = {} if baselines is None else json.loads(baselines.read_text())
-    references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
-    files = [run / "evaluations.npz" for run in runs]
-    if len(files) == 1:
-        plot_learning_curve(files[0], output, action_repeat=action_repeat, title=title, references=references)
-        return
-    methods: dict[str, list[Path]] = {}
-    for file in files:
-        methods.setdefault(file.parent.parent.name, []).append(file)
-    plot_learning_curves(methods, output, action_repeat=action_repeat, title=title, references=references)
-
-
-def _show(measured: object, output: Path | None) -> None:
-    if output is None:
-        console.print_json(data=measured)
-    else:
-        output.write_text(json.dumps(measured, indent=2) + "\n")
+    return document

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,12 @@ from typing import Any
 import torch as th
 
 from sb3_crc.atomic import atomic_write
-from sb3_crc.console import console, errors, say
+from sb3_crc.console import errors, on_a_screen, tell
 from sb3_crc.envs.rendering import probe
 from sb3_crc.experiments.engines.execution import finished
 from sb3_crc.experiments.engines.local import run_locally, threads_each, usable_cores
-from sb3_crc.experiments.needs import RENDERERS, Needs, check_disk, measure_needs, most_at_once, seconds_for_all
+from sb3_crc.experiments.needs import RENDERERS, Needs, check_disk, measure_needs, most_at_once
+from sb3_crc.experiments.plans import Plan
 from sb3_crc.experiments.runs import find_runs
 from sb3_crc.experiments.specs import RunSpec
 from sb3_crc.experiments.watching import Progress, progress_table, read_progress
@@ -112,34 +112,16 @@ def check_folder(root: Path) -> None:
         raise ValueError(f"nothing can be written to {root}: {error.strerror or error}") from None
 
 
-def describe(specs: Sequence[RunSpec], root: Path, how: Campaign) -> Iterator[str]:
+def plan(specs: Sequence[RunSpec], root: Path, how: Campaign) -> Plan:
     """
     :param specs: of a comparison
     :param root: folder of its runs
     :param how: it would be executed
-    :return: lines: what state each run is in and what it needs, and all that is to be done. Nothing is started but the
-        measurement of a few seconds of each kind of run
+    :return: what is to be done. Nothing is started but the measurement of a few seconds of each kind of run
     """
     waiting = [spec for spec in specs if not finished(root / spec.name)]
     jobs, threads, needs, reasons = _resources(waiting, how)
-    for spec in specs:
-        line = f"{root / spec.name}: {spec.agent_steps} agent steps, "
-        if spec not in waiting:
-            yield line + "finished"
-        elif spec.name in reasons:
-            yield line + f"to run, but it cannot begin: {reasons[spec.name]}"
-        else:
-            one = needs[spec.name]
-            gpu = f", {one.gpu_memory / GIGABYTE:.1f} GB on the GPU" if one.gpu_memory else ""
-            yield line + f"to run: {_duration(one.seconds)}, {_gigabytes(one.memory)} memory{gpu}, {_gigabytes(one.disk)} disk"
-    if needs:
-        known = list(needs.values())
-        at_once = sorted((one.memory for one in known), reverse=True)[:jobs]
-        where = f"{jobs} at once, threads each: {threads}" if how.engine == "local" else f"if {jobs} run at once"
-        yield (
-            f"{len(waiting)} of {len(specs)} runs to do, {where}: {_duration(seconds_for_all(known, jobs))} or more, "
-            f"{_gigabytes(sum(at_once))} memory, {_gigabytes(sum(one.disk for one in known))} disk"
-        )
+    return Plan(specs, root, waiting, jobs, threads if how.engine == "local" else None, needs, reasons)
 
 
 def execute(specs: Sequence[RunSpec], root: Path, how: Campaign) -> list[RunSpec]:
@@ -161,7 +143,7 @@ def execute(specs: Sequence[RunSpec], root: Path, how: Campaign) -> list[RunSpec
 
     def report(spec: RunSpec, event: str, remark: str) -> None:
         done = sum(finished(root / one.name) for one in specs)
-        say(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
+        tell(f"[{done}/{len(specs)}] {spec.name}: {event}{remark and f' {remark}'}")
 
     with _shown(root, specs):
         return _engine(how, jobs, needs)(specs, root, checkpoint_every=how.checkpoint_every, report=report)
@@ -199,7 +181,7 @@ def _resources(waiting: Sequence[RunSpec], how: Campaign) -> tuple[int, int, dic
         return how.jobs or 1, 1, {}, {}
     likely = how.jobs or min(len(waiting), usable_cores())
     threads = threads_each(likely) if how.engine == "local" else how.cpus or 1
-    say(f"measuring what runs need: a few seconds of each kind, with {threads} threads", errors)
+    tell(f"measuring what runs need: a few seconds of each kind, with {threads} threads")
     needs, reasons = measure_needs(waiting, threads)
     drawing = None if how.pack and probe("osmesa").draws else RENDERERS
     jobs = how.jobs or min(len(waiting), most_at_once(list(needs.values()), renderers=drawing))
@@ -209,7 +191,7 @@ def _resources(waiting: Sequence[RunSpec], how: Campaign) -> tuple[int, int, dic
 @contextmanager
 def _shown(root: Path, specs: Sequence[RunSpec]) -> Iterator[None]:
     """Within it a table of all runs, and of all together, stands in a terminal below what is said."""
-    if not console.is_terminal:
+    if not on_a_screen(errors):
         yield
         return
     from rich.live import Live
@@ -221,7 +203,7 @@ def _shown(root: Path, specs: Sequence[RunSpec]) -> Iterator[None]:
             last[:] = [_progress(spec, root / spec.name) for spec in specs]
         return progress_table(last)
 
-    with Live(get_renderable=look, console=console, refresh_per_second=0.5):
+    with Live(get_renderable=look, console=errors, refresh_per_second=0.5):
         yield
 
 
@@ -230,11 +212,3 @@ def _progress(spec: RunSpec, folder: Path) -> Progress:
     if begun is not None:
         return read_progress(begun)
     return Progress(f"{spec.method}, {spec.task}, seed {spec.seed}", "waiting", 0, spec.agent_steps, None, (), None, {})
-
-
-def _duration(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
-
-
-def _gigabytes(number: int) -> str:
-    return f"{number / GIGABYTE:.1f} GB"

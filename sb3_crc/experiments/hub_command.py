@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from sb3_crc import completion
 from sb3_crc.command import Group, command
 from sb3_crc.console import say, tell
 
@@ -21,14 +22,17 @@ RUN = "logs/crc/dmc_pixels-cartpole-swingup-v0_1"
     f"sb3-crc push {RUN} --repo-id me/crc-cartpole-swingup",
 )
 def push(
-    run: Annotated[Path, typer.Argument(help="run of train.py whose training has ended")],
-    repo_id: Annotated[str, typer.Option(help="user/name on the Hub")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="write the files here and upload nothing")] = None,
+    run: Annotated[Path, typer.Argument(help="Run of train.py whose training has ended.", autocompletion=completion.runs)],
+    repo_id: Annotated[str, typer.Option(help="user/name on the Hub.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder to write the files into, and upload nothing; else they are uploaded."),
+    ] = None,
     film: Annotated[bool, typer.Option(help="Film an episode of the final policy.")] = True,
     private: Annotated[bool, typer.Option("--private", help="Make the repository for its owner alone.")] = False,
-    message: Annotated[str, typer.Option("--message", "-m", help="of the commit")] = "A policy of sb3_crc",
+    message: Annotated[str, typer.Option("--message", "-m", help="Of the commit.")] = "A policy of sb3_crc",
 ) -> object:
-    """Share a policy on the Hugging Face Hub, with a page that says what it is worth; with -o, only write what would be sent."""
+    """Share a policy on the Hugging Face Hub, with a page that says what it is worth; -o: only write what would be sent."""
     return share(run, repo_id, output=output, filmed=film, private=private, message=message)
 
 

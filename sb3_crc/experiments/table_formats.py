@@ -5,11 +5,9 @@ import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 from sb3_crc.experiments.published import STEPS
-from sb3_crc.experiments.scores import read_scores
-from sb3_crc.experiments.tables import OurScore, PaperTable, PublishedScore, paper_table, same_steps
+from sb3_crc.experiments.tables import OurScore, PaperTable, PublishedScore, same_steps
 from sb3_crc.settings import check_name
 
 MISSING = "Not in the table:"
@@ -31,20 +29,6 @@ CSV_COLUMNS = (
     "note",
     "source",
 )
-
-
-def table_text(table: str, sources: Sequence[Path], format: str, allow_mixed: bool) -> str:
-    """
-    :param table: 100k or 500k
-    :param sources: folders that contain runs, or CSV files of scores
-    :param format: a key of :data:`FORMATS`
-    :param allow_mixed: as for :func:`paper_table`
-    :return: what ``sb3-crc table`` prints, without a newline at its end
-    :raises FileNotFoundError: if a source does not exist
-    :raises ValueError: as :func:`paper_table` and :func:`render` do
-    """
-    check_name("format", format, FORMATS)  # before much is read
-    return render(paper_table(read_scores(sources), table, allow_mixed=allow_mixed), format)
 
 
 def render(table: PaperTable, format: str) -> str:

@@ -40,14 +40,14 @@ def written(done: Result, folder: Path) -> set[str]:
 def test_latents_of_all_kinds_of_models(runs: dict[str, Path], tmp_path: Path) -> None:
     done = command("latents", runs["crc"], runs["rad"], runs["sac"], output=tmp_path)
     assert written(done, tmp_path) == {"latents.png", "latents.csv", "latents.json", "latents.md"}
-    assert "100 decisions" in done.stdout and "rollouts:" in done.stdout and "latents:" in done.stdout
+    assert "100 decisions" in done.stderr and "rollouts:" in done.stderr and "latents:" in done.stderr
     assert {row["method"] for row in read(tmp_path / "latents.csv")} == {"crc", "rad", "sac"}
 
 
 def test_tsne_of_all_kinds_of_models(runs: dict[str, Path], tmp_path: Path) -> None:
     done = command("tsne", runs["crc"], runs["sac"], "--clusters", 3, output=tmp_path)
     assert written(done, tmp_path) == {"tsne.png", "tsne.html", "tsne.csv", "tsne.json", "tsne.md"}
-    assert "tsne: " in done.stdout
+    assert "tsne: " in done.stderr
 
 
 def test_correlate_beside_the_null(runs: dict[str, Path], tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_comparison_that_was_stopped_twice_ends_as_it_would_have(tmp_path: Pat
     whole = start(tmp_path / "whole", "--jobs", "2")
     output, errors = whole.communicate(timeout=300)
     assert whole.returncode == 0, errors
-    assert output.count("begun") == 2 and output.count("finished") == 2
+    assert errors.count("begun") == 2 and errors.count("finished") == 2 and output.count("\n") == 1
     with (tmp_path / "whole" / "scores.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {(row["method"], row["policy"], row["environment_steps"]) for row in rows} == {
@@ -96,12 +96,12 @@ def test_a_comparison_that_was_stopped_twice_ends_as_it_would_have(tmp_path: Pat
     last = start(stopped, "--jobs", "2")
     output, errors = last.communicate(timeout=300)
     assert last.returncode == 0, errors
-    assert "resumed" in output
+    assert "resumed" in errors
     assert results(stopped) == results(tmp_path / "whole")
 
     again = start(stopped)
     output, errors = again.communicate(timeout=120)
-    assert again.returncode == 0 and "begun" not in output and "resumed" not in output
+    assert again.returncode == 0 and "begun" not in errors and "resumed" not in errors
 
 
 @pytest.mark.slow
@@ -114,7 +114,7 @@ def test_a_failure_does_not_stop_the_others_and_can_be_mended(tmp_path: Path) ->
     whole = [sys.executable, "-m", "sb3_crc", "sweep", str(sweep), "-o", str(tmp_path / "runs")]
     done = subprocess.run(whole, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
-    assert "broken" in done.stdout and "augmentation" in done.stdout and "[1/2]" in done.stdout
+    assert "broken" in done.stderr and "augmentation" in done.stderr and "[1/2]" in done.stderr
     assert "missing: broken on cartpole-swingup, seed 0: failed" in done.stderr
     (failure,) = (tmp_path / "runs").rglob(FAILURE)
     assert read_json(failure)["exit_code"] != 0 and "mirror" in str(read_json(failure)["last_lines"])

@@ -1,6 +1,7 @@
 """The paper's tables with ours beside: figures by hand, what is refused, and what is listed instead of averaged."""
 
 import io
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import trim_mean
+from typer.testing import CliRunner
 
+from sb3_crc.cli import app
 from sb3_crc.experiments.published import SIX_TASKS
 from sb3_crc.experiments.scores import COLUMNS, Missing, MixedProtocols, Scores, write_scores
-from sb3_crc.experiments.table_formats import CSV_COLUMNS, FORMATS, MISSING, render, table_text
+from sb3_crc.experiments.table_formats import CSV_COLUMNS, FORMATS, MISSING, render
 from sb3_crc.experiments.tables import SIX_TASK_MEAN, paper_table
 
 CARTPOLE, QUADRUPED = "cartpole-swingup", "quadruped-walk"
@@ -267,8 +270,12 @@ def test_unknown_names_are_refused_with_the_nearest(scores: Scores) -> None:
 
 
 def test_from_files_to_text(scores: Scores, tmp_path: Path) -> None:
-    write_scores(scores, tmp_path / "scores.csv")
-    text = table_text("100k", [tmp_path / "scores.csv"], "markdown", False)
-    assert "700 ± 141 (2 seeds)" in text and f"curl on {CARTPOLE}, seed 1: absent" in text
-    with pytest.raises(ValueError, match="unknown format"):
-        table_text("100k", [tmp_path / "no such file"], "html", False)
+    file = tmp_path / "scores.csv"
+    write_scores(scores, file)
+    done = CliRunner().invoke(app, ["table", "100k", str(file), "--format", "markdown"])
+    assert "700 ± 141 (2 seeds)" in done.stdout and f"curl on {CARTPOLE}, seed 1: absent" in done.stdout
+    found = json.loads(CliRunner().invoke(app, ["table", "100k", str(file), "--json"]).stdout)
+    assert found["ours"]["crc"][CARTPOLE]["mean"] == 700 and found["ours"]["crc"][CARTPOLE]["seeds"] == 2
+    assert {"method": "curl", "task": CARTPOLE, "seed": 1, "reason": "absent"} in found["missing"]
+    done = CliRunner().invoke(app, ["table", "100k", str(tmp_path / "no such file"), "--format", "html"])
+    assert done.exit_code == 2 and "unknown format" in done.stderr

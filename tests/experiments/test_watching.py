@@ -101,7 +101,8 @@ def test_a_comparison_shows_what_is_still_to_come(tmp_path: Path, monkeypatch: p
     specs = compared(["crc", "rad"], ["cartpole-swingup"], [0], env_steps=8 * STEPS, eval_every=400)
     make_run(tmp_path / specs[0].name, "crc", ended=False)
     screen = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr(campaign, "console", screen)
+    monkeypatch.setattr(screen.file, "isatty", lambda: True)
+    monkeypatch.setattr(campaign, "errors", screen)
     with campaign._shown(tmp_path, specs):
         time.sleep(0.1)  # it is drawn on entering and on leaving
     assert isinstance(screen.file, io.StringIO)

@@ -1,0 +1,147 @@
+"""Commands that measure what a task allows before anything is trained: ``sb3-crc baselines | landmarks | ladder``."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sb3_crc import completion
+from sb3_crc.command import Group, as_json, command
+from sb3_crc.console import say
+
+app = typer.Typer()
+
+RUNGS = ("state", "seen", "probe", "teach", "overfit")
+
+
+@command(app, Group.TASKS, "sb3-crc baselines cartpole-swingup --episodes 5", "sb3-crc baselines walker-walk --json")
+def baselines(
+    task: Annotated[str, typer.Argument(help="domain-task, for instance cartpole-swingup.", autocompletion=completion.tasks)],
+    output: Annotated[Path | None, typer.Option(help="JSON file to write too, for `sb3-crc curve --baselines`.")] = None,
+    episodes: Annotated[int, typer.Option(min=2, help="Episodes of each policy.")] = 20,
+    action_repeat: Annotated[
+        int | None, typer.Option(min=1, help="Environment steps per agent step; else the task's own.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of initial states and random actions.")] = 0,
+) -> object:
+    """Measure the returns of the random and of the zero policy."""
+    from sb3_crc.experiments.baselines import measure_baselines
+
+    measured = measure_baselines(task, episodes=episodes, action_repeat=action_repeat, seed=seed)
+    for name, policy in measured.items():
+        say(f"{task}, {name} policy: {policy['mean']:.1f} ± {policy['std']:.1f} ({len(policy['returns'])} episodes)")
+    _keep(measured, output)
+    return measured
+
+
+@command(app, Group.TASKS, "sb3-crc landmarks --task cartpole-swingup --task walker-walk -o landmarks.json")
+def landmarks(
+    task: Annotated[
+        list[str] | None,
+        typer.Option(help="domain-task; once for each; else the paper's ten.", autocompletion=completion.tasks),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each policy on each task.")] = 10,
+    output: Annotated[Path, typer.Option("--output", "-o", help="JSON file to write.")] = Path("landmarks.json"),
+) -> object:
+    """Measure what random actions and no actions get, on the episodes of final scores."""
+    from sb3_crc.envs.tasks import PAPER_TASKS
+    from sb3_crc.experiments.landmarks import measure_landmarks
+    from sb3_crc.experiments.runs import write_json
+
+    found = measure_landmarks(task or PAPER_TASKS, episodes=episodes)
+    write_json(found, output)
+    for name, policies in found["returns"].items():
+        say(f"{name}: {', '.join(f'{policy} {sum(own) / len(own):.1f}' for policy, own in policies.items())}")
+    return found
+
+
+@command(
+    app,
+    Group.TASKS,
+    "sb3-crc ladder probe cartpole-swingup",
+    "sb3-crc ladder seen --error 0.03 --n-steps 1 --n-steps 3 --output seen_3cm.json",
+)
+def ladder(
+    rung: Annotated[
+        str,
+        typer.Argument(
+            help="state: SAC from states; seen: SAC from positions as an encoder could see them; probe: an untrained encoder; "
+            "teach: a taught one; overfit: each loss.",
+            autocompletion=completion.one_of(*RUNGS),
+        ),
+    ],
+    task: Annotated[str, typer.Argument(help="domain-task.", autocompletion=completion.tasks)] = "cartpole-swingup",
+    output: Annotated[Path | None, typer.Option(help="JSON file to write too.")] = None,
+    config: Annotated[
+        Path, typer.Option(help="Configuration of rl-zoo whose policy_kwargs are used, rungs probe, teach, overfit.")
+    ] = Path("zoo_configs/laptop.yml"),
+    reward_scale: Annotated[float, typer.Option(help="Factor on the rewards, rung state.")] = 1.0,
+    error: Annotated[
+        list[float] | None, typer.Option(help="Of what is read off a frame, in metres, rung seen; once for each; else 0.")
+    ] = None,
+    n_steps: Annotated[
+        list[int] | None, typer.Option(help="Agent steps of the n-step return, rung seen; once for each; else 1.")
+    ] = None,
+    target_entropy: Annotated[float, typer.Option(help="Of the policy, in nats, rung seen.")] = -1.0,
+    falling_rates: Annotated[bool, typer.Option("--falling-rates", help="Learning rates that end at 0, rung seen.")] = False,
+    agent_steps: Annotated[int, typer.Option(min=600, help="Budget of each training in agent steps, rung seen.")] = 7_500,
+    evaluations: Annotated[int, typer.Option(min=1, help="How many in each training, rung seen.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
+) -> object:
+    """Measure what must work before learning from pixels can."""
+    if rung not in RUNGS:
+        raise typer.BadParameter(f"{rung!r} is none of {', '.join(RUNGS)}", param_hint="RUNG")
+    policy_kwargs = _policy_kwargs(config) if rung in ("probe", "teach", "overfit") else {}
+    from sb3_crc.experiments import ladder as rungs
+
+    if rung == "state":
+        measured: Any = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
+    elif rung == "seen":
+        shared: dict[str, Any] = {"target_entropy": target_entropy, "falling_rates": falling_rates}
+        shared |= {"agent_steps": agent_steps, "evaluations": evaluations, "seed": seed}
+        measured = [
+            rungs.seen_state_sac(task, error=one, n_steps=steps, **shared)
+            for one in error or [0.0]
+            for steps in n_steps or [1]
+        ]
+    elif rung == "probe":
+        measured = rungs.probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+    elif rung == "teach":
+        measured = rungs.teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+    else:
+        measured = [
+            rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed)
+            for name, own in rungs.OVERFITTED
+        ]
+    for name, value in _flat(measured):
+        say(f"{name}: {value}")
+    _keep(measured, output)
+    return measured
+
+
+def _policy_kwargs(config: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        return dict(yaml.safe_load(config.read_text(encoding="utf-8"))["default"]["policy_kwargs"])
+    except (yaml.YAMLError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{config} has no policy_kwargs under default: {error}") from None
+
+
+def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers and names one by one, each with where it stands."""
+    if isinstance(value, Mapping):
+        inside = value.items()
+    elif isinstance(value, list | tuple) and any(isinstance(one, Mapping) for one in value):
+        inside = dict(enumerate(value)).items()
+    else:
+        yield name, value
+        return
+    for key, one in inside:
+        yield from _flat(one, f"{name}.{key}" if name else str(key))
+
+
+def _keep(measured: object, output: Path | None) -> None:
+    if output is not None:
+        output.write_text(as_json(measured) + "\n", encoding="utf-8")
