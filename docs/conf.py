@@ -9,14 +9,18 @@ the site, where pages of the repository become pages, pictures are copied, and a
 
 import sys
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.util import logging
 
+logger = logging.getLogger(__name__)
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
@@ -51,26 +55,42 @@ html_extra_path = ["_root"]  # an index.html that leads to docs/index.html
 html_copy_source = False
 html_show_sourcelink = False
 html_math_renderer = "mathml"
-html_last_updated_fmt = None
 
 
 # -- Equations ---------------------------------------------------------------------------------------------------------
 # As MathML, made by docutils: browsers draw it themselves, so that neither building nor reading needs a network.
 
 
+def mathml(equation: str, *, as_block: bool = False) -> str:
+    """:param equation: LaTeX; :return: MathML. What docutils does not understand is a warning, which ends `make docs`."""
+    try:
+        return str(tex2mathml(equation, as_block=as_block))
+    except MathError as error:
+        logger.warning("equation %r: %s", equation, error)
+        return f"<code>{escape(equation)}</code>"
+
+
 def inline_math(translator: Any, node: nodes.math) -> None:
     """Write an equation within a line."""
-    translator.body.append(tex2mathml(node.astext(), as_block=False))
+    translator.body.append(mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def block_math(translator: Any, node: nodes.math_block) -> None:
     """Write an equation of its own."""
-    text = node.astext()
-    if "\\\\" in text and "\\begin" not in text:
-        text = f"\\begin{{aligned}}{text}\\end{{aligned}}"
-    translator.body.append(f'<div class="math">{tex2mathml(text, as_block=True)}</div>')
+    translator.body.append(f'<div class="math">{mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
+
+
+# -- Pages that were written for GitHub --------------------------------------------------------------------------------
+
+
+def one_title(app: Sphinx, doctree: nodes.document) -> None:
+    """Of a page with several titles let the first be the page's, and the others its sections."""
+    first, *others = [node for node in doctree.children if isinstance(node, nodes.section)] or [None]
+    for section in others:
+        doctree.remove(section)
+        first.append(section)
 
 
 # -- Links -------------------------------------------------------------------------------------------------------------
@@ -78,7 +98,7 @@ def block_math(translator: Any, node: nodes.math_block) -> None:
 
 def show_source(app: Sphinx, doctree: nodes.document, page: str) -> None:
     """Let links to a module of the package lead to its highlighted source instead of downloading it."""
-    documented = getattr(app.env, "_viewcode_modules", {})
+    documented = getattr(app.env, "_viewcode_modules", {})  # of sphinx.ext.viewcode
     for link in list(doctree.findall(addnodes.download_reference)):
         file = Path(link.get("filename", ""))
         target = Path(app.srcdir, app.env.doc2path(page)).parent.joinpath(link["reftarget"]).resolve()
@@ -94,4 +114,5 @@ def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     ignore: Callable[..., None] = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (inline_math, ignore), (block_math, ignore))
+    app.connect("doctree-read", one_title, priority=400)  # before titles are collected
     app.connect("doctree-resolved", show_source)
