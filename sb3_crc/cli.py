@@ -13,7 +13,6 @@ from sb3_crc.analysis.commands import app as analysis
 from sb3_crc.command import Group, No, Program, command
 from sb3_crc.console import errors, say, show, tell
 from sb3_crc.experiments.commands import app as experiments
-from sb3_crc.experiments.hub_command import app as hub
 
 if TYPE_CHECKING:
     from sb3_crc.doctor import Finding
@@ -37,7 +36,6 @@ README.md and docs/command_line.md say more."""
 app = typer.Typer(cls=Program, no_args_is_help=True, help=HELP, epilog=EPILOG, pretty_exceptions_enable=False)
 app.add_typer(experiments)
 app.add_typer(analysis)
-app.add_typer(hub)
 
 MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "broken": "[red]broken[/]"}
 

@@ -17,7 +17,7 @@ import rl_zoo3
 from huggingface_sb3 import EnvironmentName, ModelName
 from rl_zoo3.utils import get_model_path
 
-from sb3_crc.experiments.hub_command import share
+from sb3_crc.experiments.commands.sharing import share
 from sb3_crc.zoo.algorithms import register
 
 

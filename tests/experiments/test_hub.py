@@ -204,6 +204,9 @@ def test_push_uploads_what_output_writes(run: Run, tmp_path: Path, fake_hub: Fak
     code, output = shell("push", str(run.folder), "--repo-id", "me/policy", "--no-film", "-o", str(tmp_path / "page"))
     assert code == 0 and fake_hub.calls == []
     assert "not evaluated, and the page says so" in output
+    code, output = shell("push", str(run.folder), "--repo-id", "me/policy", "--no-film", "-o", str(tmp_path / "too"), "--json")
+    document = json.loads(output[output.index("{") :])
+    assert document["address"] is None and document["files"].keys() == {path.name for path in (tmp_path / "page").iterdir()}
     code, output = shell("push", str(run.folder), "--repo-id", "me/policy", "--no-film", "--private", "-m", "First")
     assert code == 0, output
     assert "https://huggingface.co/me/policy" in output
