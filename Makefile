@@ -11,7 +11,7 @@ TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 STAMP := .venv/.installed-$(shell cat pyproject.toml constraints.txt | cksum | tr ' ' '-')
 
-.PHONY: help train test test-slow test-long reproduce-quick results bench lint constraints doctor clean install rendering
+.PHONY: help train test test-slow test-long reproduce-quick results docs bench lint constraints doctor clean install rendering
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
@@ -41,6 +41,9 @@ results: $(STAMP) ## docs/results.md from the raw files in results/
 	@.venv/bin/python -m sb3_crc results results/laptop/final --baseline crc --landmarks results/landmarks.json \
 	  --trials results/laptop/trials.csv -o docs/results.md
 
+docs: $(STAMP) ## the documentation site, docs/_build/html/index.html; needs no network
+	@.venv/bin/python -m sphinx -W --keep-going -q -b html -c docs . docs/_build/html
+
 bench: rendering ## speed and memory beside peers, two hours on two idle cores; one alone: make bench ARGS=update
 	@.venv/bin/python -m benchmarks $(or $(ARGS),all)
 
@@ -61,7 +64,7 @@ doctor: $(STAMP) ## show what works on this machine
 	@.venv/bin/python -m sb3_crc doctor
 
 clean: ## remove .venv, caches and build output; logs stay
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 install: $(STAMP) ## the virtual environment alone
