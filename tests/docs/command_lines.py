@@ -10,7 +10,6 @@ import runpy
 import shlex
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -121,7 +120,7 @@ def check_benchmarks(words: list[str]) -> None:
 # -- rl_zoo3's scripts -------------------------------------------------------------------------------------------------
 
 
-class Parsed(Exception):  # noqa: N818
+class Parsed(Exception):
     """What a script was given; raised where it would begin to work."""
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -234,11 +233,10 @@ def check_pip(words: list[str]) -> None:
     if words[:1] != ["install"]:
         raise NotUnderstood(f"pip {words[0]}")
     _, packages = create_command("install").parse_args(words[1:])
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    section = (ROOT / "pyproject.toml").read_text().partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    known = {*re.findall(r"^(\w+) = ", section, re.MULTILINE)}
     for package in [*packages, *words]:
-        if (extras := re.fullmatch(r"(?:\.|sb3-crc)\[(.*)\]", package)) and (
-            unknown := {*extras[1].split(",")} - {*project["optional-dependencies"]}
-        ):
+        if (extras := re.fullmatch(r"(?:\.|sb3-crc)\[(.*)\]", package)) and (unknown := {*extras[1].split(",")} - known):
             raise NotUnderstood(f"no extra {sorted(unknown)[0]!r}")
 
 

@@ -1,4 +1,4 @@
-"""Whether the YAML of the pages would be understood: the checks of ``zoo_configs``, on sweeps, configurations and parts of them."""
+"""Whether the YAML of the pages would be understood: by the checks of ``zoo_configs``, on sweeps, configurations and parts."""
 
 import importlib
 import inspect
