@@ -145,7 +145,10 @@ def _conditions(final: "pd.DataFrame") -> Iterator[str]:
 def _trials(path: Path) -> Iterator[str]:
     import pandas as pd
 
-    counts = pd.read_csv(path)["algo"].value_counts(sort=False)
+    try:
+        counts = pd.read_csv(path)["algo"].value_counts(sort=False)
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"{path} is no table of trials: {error}") from error
     yield from ["## Trials before", ""]
     yield from _paragraph(
         f"The settings were found by trials on cartpole-swingup ({path.name}): "

@@ -152,7 +152,7 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
     """
     try:
         content = yaml.load(file.read_text(encoding="utf-8"), _UniqueKeys)  # a SafeLoader
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{file} is no sweep: it must be a mapping with {', '.join(sorted(SWEEP_KEYS))}")
