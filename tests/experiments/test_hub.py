@@ -300,7 +300,7 @@ def test_the_pages_settings_train_again(run: Run, tmp_path: Path) -> None:
     )
     (tmp_path / "settings.yml").write_text(settings)
     program = [sys.executable, str(ROOT / "train.py"), *command.split()[2:], "--device", "cpu", "--verbose", "0"]
-    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-2000:]
     again = Run(tmp_path / "logs" / "crc" / f"{NAME}_1")
     assert json.dumps(again.settings, sort_keys=True) == json.dumps(SETTINGS, sort_keys=True) and again.seed == 3
