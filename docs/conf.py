@@ -7,6 +7,7 @@ The source folder is the repository, not ``docs/``. So a relative link or pictur
 the site, where pages of the repository become pages, pictures are copied, and any other file can be downloaded.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from html import escape
@@ -82,6 +83,14 @@ def block_math(translator: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+# -- Docstrings --------------------------------------------------------------------------------------------------------
+
+
+def one_field_a_line(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Short docstrings have several fields on a line, ``:param x: this; :return: that``; Sphinx wants a line for each."""
+    lines[:] = [part for line in lines for part in re.split(r"[;,.]\s+(?=:(?:param|return|raises)\b)", line)]
+
+
 # -- Pages that were written for GitHub --------------------------------------------------------------------------------
 
 
@@ -114,5 +123,6 @@ def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     ignore: Callable[..., None] = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (inline_math, ignore), (block_math, ignore))
+    app.connect("autodoc-process-docstring", one_field_a_line)
     app.connect("doctree-read", one_title, priority=400)  # before titles are collected
     app.connect("doctree-resolved", show_source)

@@ -1,4 +1,4 @@
-"""What tells a sick run from its log. The README's glossary explains each number.
+"""What tells a sick run from its log. docs/metrics.md explains each number.
 
 B batch, F flattened convolution output, Z latent.
 """

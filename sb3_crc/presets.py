@@ -30,7 +30,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "augmentation": "random_crop",
         "objectives": CRC_OBJECTIVES,
     },
-    # CRC-RL as its released code does it: the rows of the README's table of differences, by settings. The latent penalty
+    # CRC-RL as its released code does it: the rows of docs/fidelity.md, by settings. The latent penalty
     # and the decoder's weight decay enter the code's loss at weight 1, hence the division by the weight of the reconstruction.
     "crc_release": {
         "batch_size": 128,

@@ -13,6 +13,7 @@ from sb3_crc import CRCSAC, PRESETS
 from sb3_crc.augmentations import AUGMENTATIONS
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.stock import STOCK
+from tests.conftest import make_model
 from tests.docs.fences import PAGES, ROOT
 
 WRITTEN = sorted([*PAGES, *ROOT.glob("results/*/README.md"), ROOT / "SECURITY.md", ROOT / "CHANGELOG.md"])
@@ -37,6 +38,17 @@ def test_every_argument_is_explained_with_its_default() -> None:
         assert name in written, f"docs/hyperparameters.md does not explain {name}"
         default = eval(written[name]) if name == "objectives" else ast.literal_eval(written[name])  # has 1/3
         assert default == parameter.default, name
+
+
+def test_every_logged_number_is_explained() -> None:
+    names = [name for row in rows(page("metrics.md")) for name in re.findall(r"`(\w+/[^`]+)`", row[0])]
+    patterns = [re.compile(re.escape(name).replace("<objective>", "[a-z]+").replace(r"\*", ".*")) for name in names]
+    model = make_model(objectives=PRESETS["crc"]["objectives"])
+    model.train(gradient_steps=100, batch_size=16)  # every hundredth update looks at the latent's health
+    logged = {name for name in model.logger.name_to_value if name.startswith(("train/", "representation/"))}
+    assert len(logged) > 25
+    unexplained = {name for name in logged if not any(pattern.fullmatch(name) for pattern in patterns)}
+    assert unexplained <= {"train/n_updates"}  # SB3's
 
 
 def test_every_augmentation_and_preset_is_named() -> None:
