@@ -5,13 +5,14 @@ SHELL := /bin/sh
 PYTHON ?=                                   # an interpreter, 3.10 to 3.12; empty: the first suitable one
 ARGS ?=                                     # more flags for `make train` or pytest
 TRAIN_ARGS = --algo crc --env dmc_pixels/cartpole-swingup-v0 --conf-file zoo_configs/laptop.yml --progress \
-	--eval-freq 625 --eval-episodes 5 --checkpoint-every 1000 --verbose 0 -f logs $(ARGS)
+	--eval-freq 625 --eval-episodes 5 --checkpoint-every 1000 --vec-env subproc --verbose 0 -f logs $(ARGS)
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 # Two test processes share two cores: more threads each would only wait for one another.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+EVERYTHING := .[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]
 STAMP := .venv/.installed-$(shell cat pyproject.toml constraints.txt | cksum | tr ' ' '-')
 
-.PHONY: help train test test-slow test-long reproduce-quick results docs bench lint constraints doctor clean install rendering
+.PHONY: help train test test-slow test-long test-lowest reproduce-quick results docs bench coverage format lint type dist constraints doctor clean install rendering
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do \
@@ -32,6 +33,15 @@ test-slow: rendering ## the slow tests: real environments, real training runs
 test-long: rendering ## the tests that take hours
 	@.venv/bin/python -m pytest -m long $(ARGS) || [ $$? -eq 5 ]
 
+test-lowest: rendering ## the fast tests with the lowest allowed versions of all but torch, in .venv-lowest
+	.venv/bin/python -m venv --clear .venv-lowest
+	.venv/bin/uv pip compile -q -p .venv-lowest --resolution lowest-direct --all-extras pyproject.toml -o .venv-lowest/versions.txt
+	.venv-lowest/bin/python -m pip install -q --disable-pip-version-check -c .venv-lowest/versions.txt -e '$(EVERYTHING)'
+	@$(ONE_THREAD) .venv-lowest/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)
+
+coverage: rendering ## the lines of sb3_crc/ that the fast tests run; fails below 90 %
+	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" --cov $(ARGS)
+
 reproduce-quick: rendering ## one row of docs/results.md anew, about an hour on two idle cores, and compare
 	@.venv/bin/python -m sb3_crc compare --task cartpole-swingup --presets crc --seeds 1 --first-seed 21 --eval-every 20000 \
 	  --conf-file zoo_configs/laptop.yml -o reproduction --jobs 1 $(ARGS)
@@ -46,6 +56,16 @@ docs: $(STAMP) ## the documentation site, docs/_build/html/index.html; needs no 
 
 bench: rendering ## speed and memory beside peers, two hours on two idle cores; one alone: make bench ARGS=update
 	@.venv/bin/python -m benchmarks $(or $(ARGS),all)
+
+format: $(STAMP) ## put the code in order
+	.venv/bin/ruff check --fix .
+	.venv/bin/ruff format .
+
+type: $(STAMP) ## types alone
+	.venv/bin/mypy --strict sb3_crc
+
+dist: $(STAMP) ## wheel and sdist in dist/, the same bytes wherever they are built
+	.venv/bin/python -m build --no-isolation
 
 lint: $(STAMP) ## style, types, import contracts, docstrings
 	.venv/bin/ruff check .
@@ -64,7 +84,7 @@ doctor: $(STAMP) ## show what works on this machine
 	@.venv/bin/python -m sb3_crc doctor
 
 clean: ## remove .venv, caches and build output; logs stay
-	rm -rf .venv build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv .venv-lowest build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 install: $(STAMP) ## the virtual environment alone
@@ -89,5 +109,5 @@ $(STAMP):
 	if [ "$$(uname -sm)" = "Linux x86_64" ] && ! nvidia-smi >/dev/null 2>&1 && timeout 3 .venv/bin/python -c \
 	  'from urllib.request import urlopen; urlopen("$(TORCH_CPU_INDEX)/torch/", timeout=3)' >/dev/null 2>&1; \
 	then index="--extra-index-url $(TORCH_CPU_INDEX)"; fi; \
-	exec .venv/bin/python -m pip install --disable-pip-version-check $$index -c constraints.txt -e '.[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]'
+	exec .venv/bin/python -m pip install --disable-pip-version-check $$index -c constraints.txt -e '$(EVERYTHING)'
 	@touch $@

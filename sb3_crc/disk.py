@@ -47,8 +47,8 @@ def outlived(what: object) -> Iterator[None]:
 
 class EnduringFile:
     """
-    A text file in place of one of SB3's, whose errors are warnings, one until it can be written again. Nothing that was written is
-    lost: what does not fit is kept, and written with the next line if there is room then.
+    A text file in place of one of SB3's, whose errors are warnings, one until it can be written again. Nothing that was
+    written is lost: what does not fit is kept, and written with the next line if there is room then.
 
     :param file: opened for writing; it is closed, and opened again for as long as something is written
     """

@@ -95,8 +95,9 @@ def test_errors_that_are_not_the_disks_are_raised(tmp_path: Path, monkeypatch: p
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
     file = EnduringFile((tmp_path / "log.csv").open("w"))
     file.write("a line\n")
-    with monkeypatch.context() as broken, pytest.raises(ConnectionResetError):
-        broken.setattr(file, "_append", lambda more: (_ for _ in ()).throw(ConnectionResetError(errno.ECONNRESET, "reset")))
+    reset = ConnectionResetError(errno.ECONNRESET, "reset")
+    monkeypatch.setattr(file, "_append", lambda more: (_ for _ in ()).throw(reset))
+    with pytest.raises(ConnectionResetError):
         file.flush()
 
 

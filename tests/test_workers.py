@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
 
 from sb3_crc import CRCSAC
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
+from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
 from tests.checkpoints.test_callback import SETTINGS, STEPS, assert_equal, cartpole
 from tests.conftest import POLICY_KWARGS, NoiseEnv
@@ -108,23 +109,46 @@ def test_a_training_goes_on_with_a_replaced_environment(tmp_path: Path) -> None:
     assert model.num_timesteps == 60 and model._n_updates == 20
 
 
-class DiesOnce(Monitor):  # type: ignore[type-arg]
-    """A task whose process is killed at one of its steps, once."""
+class FailsOnce(Monitor):  # type: ignore[type-arg]
+    """A task at one of whose steps its process is killed, or its OpenGL context destroyed, once."""
 
-    def __init__(self, marker: Path | None, seed: int):
+    def __init__(self, how: str, marker: Path | None, seed: int):
         super().__init__(cartpole(seed))
-        self.marker, self.count = marker, 0
+        self.how, self.marker, self.count = how, marker, 0
 
     def step(self, action: Any) -> Any:
         self.count += 1
         if self.marker is not None and self.count == 33 and not self.marker.exists():
             self.marker.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "dies":
+                os.kill(os.getpid(), signal.SIGKILL)
+            destroy_context(self)
         return super().step(action)
 
 
-def train(folder: Path, marker: Path | None) -> CRCSAC:
-    env = WatchedSubprocVecEnv([partial(DiesOnce, marker, 0)], timeout=60)
+def destroy_context(env: Any) -> None:
+    """What a reset of the driver does to it. It goes when another one is used."""
+    from dm_control._render.pyopengl import egl_renderer
+    from OpenGL import EGL
+
+    context = env.get_wrapper_attr("physics").contexts.gl
+    with context.make_current() as executor:
+        executor.call(EGL.eglDestroyContext, egl_renderer.EGL_DISPLAY, context._context)
+    cartpole(0).reset(seed=0)
+
+
+@pytest.mark.skipif(os.environ.get("MUJOCO_GL", "egl") != "egl", reason="destroys a context of EGL")
+def test_a_lost_context_is_named() -> None:
+    env = cartpole(0)
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    destroy_context(env)
+    with pytest.raises(RenderingUnavailable, match=r"OpenGL draws no more \(EGLError .*its context is lost"):
+        env.step(np.zeros(1, np.float32))
+
+
+def train(folder: Path, marker: Path | None, how: str = "dies") -> CRCSAC:
+    env = WatchedSubprocVecEnv([partial(FailsOnce, how, marker, 0)], timeout=60)
     model = CRCSAC("CnnPolicy", env, seed=0, **SETTINGS)
     checkpoint = TrainingCheckpoint(folder, every=10)
     try:
@@ -135,10 +159,11 @@ def train(folder: Path, marker: Path | None) -> CRCSAC:
     return model
 
 
-def test_a_training_whose_environment_died_goes_on_to_the_same_end(tmp_path: Path) -> None:
+def test_a_training_whose_environment_failed_goes_on_to_the_same_end(tmp_path: Path) -> None:
     whole = train(tmp_path / "whole", None)
-    marker = tmp_path / "died"
-    with pytest.raises(WorkerError, match="environment 0"):
-        train(tmp_path / "run", marker)
-    assert marker.exists() and sorted(path.name for path in (tmp_path / "run").glob("0*"))[-1] == "000000000030"
-    assert_equal(train(tmp_path / "run", marker), whole)
+    for how in ("dies", "loses its context"):
+        run, marker = tmp_path / how, tmp_path / f"{how} was here"
+        with pytest.raises(WorkerError, match="environment 0"):
+            train(run, marker, how)
+        assert marker.exists() and sorted(path.name for path in run.glob("0*"))[-1] == "000000000030"
+        assert_equal(train(run, marker), whole)

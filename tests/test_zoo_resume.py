@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -96,16 +97,22 @@ def test_a_killed_run_ends_as_it_would_have(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_says_how_to_go_on(signum: int, tmp_path: Path) -> None:
-    flags = ["-n", "100000", "--eval-freq", "-1", "--verbose", "0", "--checkpoint-every", "40"]
-    run = subprocess.Popen(command(tmp_path, *flags), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True)
+    """As a terminal or a scheduler sends it: to each process, those of the environments included."""
+    flags = ["-n", "100000", "--eval-freq", "-1", "--verbose", "0", "--checkpoint-every", "40", "--vec-env", "subproc"]
+    run = subprocess.Popen(
+        command(tmp_path, *flags), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     checkpoints = tmp_path / RUN / CHECKPOINTS
     deadline = time.time() + 200
     while not (checkpoints / "000000000080").exists():
         assert run.poll() is None and time.time() < deadline
         time.sleep(0.05)
-    run.send_signal(signum)
+    processes = psutil.Process(run.pid).children(recursive=True)
+    assert len(processes) >= 2
+    os.killpg(run.pid, signum)
     output, _ = run.communicate(timeout=100)
     assert run.returncode == 128 + signum
+    assert not psutil.wait_procs(processes, timeout=10)[1]
     last_line = output.strip().splitlines()[-1]
     assert "To go on from the last checkpoint: " in last_line and last_line.endswith(f"--resume {tmp_path / RUN}")
     stopped_at = int(last_line.partition("stopped at ")[2].split()[0])

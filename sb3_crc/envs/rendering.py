@@ -148,6 +148,21 @@ def first_frame_watched() -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
+@contextlib.contextmanager
+def loss_of_context_named() -> Iterator[None]:
+    """:raises RenderingUnavailable: in place of an error of OpenGL's, whose own text is a number at best"""
+    try:
+        yield
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] not in {"OpenGL", "mujoco"}:
+            raise
+        what = f"{type(error).__name__} {getattr(error, 'err', '')}".strip()  # its str() may fail in turn
+        raise RenderingUnavailable(
+            f"OpenGL draws no more ({what}, MUJOCO_GL={os.environ.get('MUJOCO_GL')}): its context is lost, as when a driver is "
+            "reset. A new process can draw again; a training goes on there from its last checkpoint"
+        ) from error
+
+
 def prove_backend() -> Probe:
     """Choose as :func:`select_backend` does and draw one frame with the choice, even if MUJOCO_GL was set by hand.
 

@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.rendering import RenderingUnavailable, first_frame_watched, select_backend
+from sb3_crc.envs.rendering import RenderingUnavailable, first_frame_watched, loss_of_context_named, select_backend
 from sb3_crc.envs.state import State, read_task, write_task
 
 LARGE_PICTURE = 480  # side of render()'s picture in pixels: all that fits the suite's 640 x 480 off-screen buffer
@@ -134,6 +134,7 @@ class SimulatorStep(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """
         :param segmentation: not the picture but what is seen in it
         :return: as :meth:`render`; or int32 (S, S, 2), upside down in memory: id and type of the object, -1 for none
+        :raises RenderingUnavailable: if the OpenGL context is lost
         """
         size_and_camera = dict(self.get_wrapper_attr("render_kwargs"))
         flags = size_and_camera.pop("render_flag_overrides", None)
@@ -143,9 +144,10 @@ class SimulatorStep(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._camera = Camera(self.get_wrapper_attr("physics"), **size_and_camera)
             with first_frame_watched():  # a driver that hangs does so here
                 self._camera.render(render_flag_overrides=flags)
-        if segmentation:
-            return self._camera.render(segmentation=True)
-        return self._camera.render(render_flag_overrides=flags)
+        with loss_of_context_named():
+            if segmentation:
+                return self._camera.render(segmentation=True)
+            return self._camera.render(render_flag_overrides=flags)
 
     def close(self) -> None:
         """Free the simulator and its OpenGL context."""

@@ -45,6 +45,9 @@ LOGS = 5_000_000
 #: Bytes that a run takes beside what is measured: rl_zoo3, logs, evaluations, checkpoints (0.36 and 0.43 GB in two runs of
 #: laptop.yml)
 AROUND = 450_000_000
+#: Bytes of an environment's own process, with OpenGL in software
+WORKER = 250_000_000
+
 #: Share of the free memory that runs may take
 USABLE = 0.9
 #: Processes that draw on one GPU at the same time and are known to work
@@ -155,9 +158,10 @@ def measure(spec: RunSpec) -> Needs:
     model.save(archive)
     frames = _bytes_of_experience(spec, model)
     on_gpu = model.device.type == "cuda"
+    around = AROUND + WORKER * (env.num_envs + 1)  # one more evaluates
     return Needs(
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-        + (AROUND if on_gpu else AROUND + frames),
+        + (around if on_gpu else around + frames),
         gpu_memory=int(th.cuda.max_memory_reserved()) + frames if on_gpu else 0,
         disk=frames + MODELS * archive.tell() + LOGS,
         seconds=decisions * deciding

@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.configurations import configuration_file, settings_for
+from sb3_crc.disk import is_of_disk
 from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.experiments.provenance import provenance
@@ -136,12 +137,25 @@ class CRCExperimentManager(ExperimentManager):
             type(self).stopped_by = checkpoint.stopped_by
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """Save the final model, draw the learning curve, film the best policy, and say how to go on."""
-        super().save_trained_model(model)
+        """
+        Save the final model, draw the learning curve, film the best policy, and say how to go on.
+
+        :raises SystemExit: if the disk fails; with checkpoints, to go on is to save again
+        """
+        try:
+            super().save_trained_model(model)
+        except OSError as error:
+            if not is_of_disk(error):
+                raise
+            raise SystemExit(f"The model could not be saved in {self.save_path}: {error}\n{self._how_to_save()}") from None
         environment = self.create_envs(1, eval_env=True)
         try:
             self._draw_learning_curve(environment)
             self._film(model, environment)
+        except OSError as error:
+            if not is_of_disk(error):
+                raise
+            logger.warning("learning curve and film of %s could not be written: %s", self.save_path, error)
         finally:
             environment.close()
         say(self._how_to_go_on(model.num_timesteps))
@@ -177,12 +191,19 @@ class CRCExperimentManager(ExperimentManager):
         formats = ["csv", *["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)]
         return configure(self.save_path, formats + ["stdout"] * (self.verbose > 0))
 
+    def _how_to_save(self) -> str:
+        if self.plan.checkpoint_every is None:
+            return "Without --checkpoint-every nothing else holds the training."
+        return f"When the disk is writable again, from the last checkpoint: {self._resume()}"
+
+    def _resume(self) -> str:
+        return shlex.join([*sys.orig_argv[: sys.orig_argv.index(sys.argv[0]) + 1], "--resume", self.save_path])
+
     def _how_to_go_on(self, done: int) -> str:
         more = self.n_timesteps - done if done < self.n_timesteps else self.n_timesteps
         state = "finished" if done >= self.n_timesteps else f"stopped at {done} of {self.n_timesteps} agent steps"
         if self.plan.checkpoint_every is not None and done < self.n_timesteps:
-            command = [*sys.orig_argv[: sys.orig_argv.index(sys.argv[0]) + 1], "--resume", self.save_path]
-            return f"Training {state}. To go on from the last checkpoint: {shlex.join(command)}"
+            return f"Training {state}. To go on from the last checkpoint: {self._resume()}"
         # The last of two equal flags counts, so the run's own command keeps its settings.
         command = [*sys.orig_argv, "-i", os.path.join(self.save_path, f"{self.env_name}.zip"), "-n", str(more)]
         return f"Training {state}. To go on: {shlex.join(command)}"

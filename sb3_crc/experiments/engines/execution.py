@@ -198,7 +198,7 @@ class RunProcess:
         flags = ["--algo", spec.preset, "--env", environment_id(spec.task), "--conf-file", str(self.folder / SETTINGS)]
         flags += ["-n", str(spec.agent_steps), "--seed", str(spec.seed), "-f", str(self.folder), "--verbose", "0"]
         flags += ["--eval-freq", str(spec.eval_every // spec.action_repeat), "--eval-episodes", str(spec.eval_episodes)]
-        return [*flags, "--checkpoint-every", str(self.checkpoint_every)]
+        return [*flags, "--vec-env", "subproc", "--checkpoint-every", str(self.checkpoint_every)]
 
     def _evaluation(self, run: Path) -> list[str]:
         return [sys.executable, "-m", "sb3_crc", "evaluate", str(run), "--episodes", str(self.spec.eval_episodes)]
