@@ -158,8 +158,8 @@ def loss_of_context_named() -> Iterator[None]:
             raise
         what = f"{type(error).__name__} {getattr(error, 'err', '')}".strip()  # its str() may fail in turn
         raise RenderingUnavailable(
-            f"OpenGL draws no more ({what}, MUJOCO_GL={os.environ.get('MUJOCO_GL')}): its context is lost, as when a driver is "
-            "reset. A new process can draw again; a training goes on there from its last checkpoint"
+            f"OpenGL draws no more ({what}, MUJOCO_GL={os.environ.get('MUJOCO_GL')}): its context is lost, as when a driver "
+            "is reset. A new process can draw again; a training goes on there from its last checkpoint"
         ) from error
 
 
