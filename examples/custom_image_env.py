@@ -8,8 +8,9 @@ What CRCSAC asks of an environment:
 - A Monitor is around it, for ``rollout/ep_rew_mean`` in the log. ``make_vec_env`` adds one.
 
 ``terminated`` means that nothing more is to be got (here: off the road), ``truncated`` that time is up: SAC bootstraps there.
+Measured with seed 0: random actions make 9 per cent of a lap, 2 500 decisions of training 60; full speed allows about 77.
 
-    python examples/custom_image_env.py --steps 4000
+    python examples/custom_image_env.py --steps 2500
 """
 
 import argparse
@@ -105,10 +106,9 @@ def make_track(seed: int = 0) -> VecEnv:
 def main() -> None:
     """Train, and compare with before."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=4_000, help="decisions to learn from")
+    parser.add_argument("--steps", type=int, default=2_500, help="decisions to learn from")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-
     model = CRCSAC("CnnPolicy", make_track(given.seed), seed=given.seed, verbose=1, **SMALL)
     before, _ = evaluate_policy(model, make_track(1_000), n_eval_episodes=10)
     model.learn(given.steps, log_interval=10)

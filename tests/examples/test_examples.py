@@ -121,12 +121,12 @@ def test_crcsac_learns_the_frames_from_the_stack(
 
 @pytest.mark.slow
 def test_the_track_is_learned() -> None:
-    """Random steering and gas make 9 per cent of a lap."""
+    """Random steering and gas make 9 per cent of a lap; with this seed 60 were measured."""
     from custom_image_env import SMALL, make_track
 
     model = CRCSAC("CnnPolicy", make_track(0), seed=0, device="cpu", **SMALL).learn(2_500)
     score, _ = evaluate_policy(model, make_track(1_000), n_eval_episodes=10)
-    assert score > 25
+    assert score > 40
 
 
 # -- td3_and_tqc.py ----------------------------------------------------------------------------------------------------
