@@ -33,14 +33,23 @@ class NotUnderstood(AssertionError):
 
 
 def check_command_line(line: str) -> None:
-    """:raises NotUnderstood: with the reason"""
-    words = shlex.split(line, comments=True)
+    """:param line: a command, or several with pipes between them; :raises NotUnderstood: with the reason"""
+    words: list[str] = []
+    for word in [*shlex.split(line, comments=True), "|"]:
+        if word != "|":
+            words.append(word)
+            continue
+        _check_command(line, words)
+        words = []
+
+
+def _check_command(line: str, words: list[str]) -> None:
     path = list(sys.path)
     while words and (variable := re.fullmatch(r"([A-Z_0-9]+)=(.*)", words[0])):  # VARIABLE=value before the command
         if variable[1] == "PYTHONPATH":
             path.insert(0, str(ROOT / variable[2]))
         words = words[1:]
-    if {"&&", "|", ";", ">"} & {*words} or any(word.endswith(";") for word in words):
+    if not words or {"&&", "||", ";", ">"} & {*words} or any(word.endswith(";") for word in words):
         raise NotUnderstood(f"{line}: one command a line, without the shell's own words")
     for programs, check in PROGRAMS.items():
         for program in programs:
@@ -252,6 +261,12 @@ def check_script(words: list[str]) -> None:
         options_of(lambda: runpy.run_path(str(ROOT / words[0]), run_name="__main__"))
 
 
+def check_jq(words: list[str]) -> None:
+    """One filter."""
+    if len(words) != 1 or words[0].startswith("-"):
+        raise NotUnderstood("jq takes a filter")
+
+
 #: Beginnings of a command line -> what checks the rest; the longer ones come first
 PROGRAMS: dict[tuple[str, ...], Callable[[list[str]], object]] = {
     ("make",): check_make,
@@ -261,5 +276,6 @@ PROGRAMS: dict[tuple[str, ...], Callable[[list[str]], object]] = {
     ("python -m benchmarks",): check_benchmarks,
     ("python train.py",): check_train,
     ("pip", "python -m pip"): check_pip,
+    ("jq",): check_jq,
     ("python",): check_script,
 }

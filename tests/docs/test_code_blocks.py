@@ -1,6 +1,9 @@
 """Every code block of README, CONTRIBUTING and docs/: Python runs, command lines and YAML are read by what would read them."""
 
 import importlib
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,9 +14,12 @@ from tests.docs.settings import check_yaml
 
 #: Directives of MyST, whose content `make docs` reads
 DIRECTIVES = {"{toctree}", "{eval-rst}", "{literalinclude}"}
-LANGUAGES = {"python", "console", "yaml"}
+SHELL = ("console", "sh")
+LANGUAGES = {"python", "yaml", *SHELL}
 
-LINES = {line: block for block in all_blocks("console") for line in command_lines(block)}
+#: Command lines that are run as they are
+RUN = ("sb3-crc rendering", "sb3-crc doctor", "sb3-crc enjoy results/laptop/cartpole-swingup/policy.sb3crc")
+LINES = {line: block for language in SHELL for block in all_blocks(language) for line in command_lines(block)}
 
 
 def check_language(language: str) -> None:
@@ -44,6 +50,16 @@ def test_command_lines_are_understood(line: str, capsys: pytest.CaptureFixture[s
         check_command_line(line)
     except NotUnderstood as error:
         raise AssertionError(f"{LINES[line]}: {error}\n{capsys.readouterr().err}") from error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", RUN)
+def test_cheap_commands_run(line: str) -> None:
+    """Those that need nothing but the repository, and write nothing."""
+    assert line in LINES
+    words = shlex.split(line)[1:]
+    done = subprocess.run([sys.executable, "-m", "sb3_crc", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.strip(), done.stderr
 
 
 @pytest.mark.parametrize("block", all_blocks("yaml"), ids=str)
@@ -100,6 +116,9 @@ def test_an_unknown_language_fails(language: str) -> None:
         "pip install --constrain2 x",
         "cargo build",
         "sb3-crc doctor && rm -r logs",
+        "sb3-crc doctor --json | js .works",
+        "sb3-crc doctor --jsn | jq .works",
+        "sb3-crc doctor |",
     ],
 )
 def test_a_mistake_in_a_command_line_fails(line: str) -> None:
