@@ -6,6 +6,7 @@ A stand-in for Python records what it is asked to do, so nothing is downloaded a
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -87,7 +88,9 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path)
 
 
-INSTALL = "-m pip install --disable-pip-version-check -c constraints.txt -e .[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]"
+INSTALL = (
+    "-m pip install --disable-pip-version-check -c constraints.txt -e .[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]"
+)
 RENDERING = "-m sb3_crc rendering --install"
 FAST_TESTS = "-m pytest -n 2 -m not slow and not long"
 
@@ -128,6 +131,13 @@ def test_pytorchs_cpu_index_only_without_gpu_and_if_it_answers(checkout: Checkou
     checkout.make("install", FAKE_GPU=gpu, FAKE_INDEX=answers)
     installation = next(call for call in checkout.calls() if "pip install" in call)
     assert ("--extra-index-url https://download.pytorch.org/whl/cpu" in installation) == used
+
+
+def test_help_lists_what_there_is(checkout: Checkout) -> None:
+    listed = set(re.findall(r"^  make ([a-z-]+) +\S", checkout.make("help").stdout, re.MULTILINE))
+    phony = (ROOT / "Makefile").read_text().split(".PHONY: ", 1)[1].split("\n", 1)[0].split()
+    assert listed == set(phony) - {"rendering"}  # a part of others
+    assert {"format", "lint", "type", "test", "test-long", "test-lowest", "coverage", "bench", "docs", "dist"} <= listed
 
 
 def test_no_slow_tests_is_no_failure(checkout: Checkout) -> None:

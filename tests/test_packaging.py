@@ -1,11 +1,13 @@
 """What is installed fits together, and importing the package stays light."""
 
 import ast
+import statistics
 import subprocess
 import sys
 from pathlib import Path
 
 import gymnasium as gym
+import pytest
 
 import sb3_crc
 
@@ -42,3 +44,44 @@ def test_public_names_are_imported_when_they_are_asked_for() -> None:
     assert homes == {name: home for home, names in sb3_crc._HOMES.items() for name in names}
     assert set(homes) == set(sb3_crc.__all__) and set(homes) < set(dir(sb3_crc))
     assert not hasattr(sb3_crc, "CRCSACK")
+
+
+def test_importing_every_public_name_loads_nothing_optional() -> None:
+    """What only an extra brings, and what a command alone needs."""
+    code = "import sys; from sb3_crc import *; print(*{name.split('.')[0] for name in sys.modules})"
+    loaded = set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+    assert {"torch", "stable_baselines3"} <= loaded
+    extras = {"av", "ray", "submitit", "sklearn", "plotly", "rliable", "rl_zoo3", "wandb", "onnx", "onnxruntime", "optuna"}
+    from_sb3 = {"matplotlib", "pandas", "tensorboard"}  # SB3 imports those itself where they are installed
+    code = "import sys, stable_baselines3; print(*{name.split('.')[0] for name in sys.modules})"
+    of_sb3 = set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+    assert loaded & (extras | from_sb3 | {"typer", "dm_control", "shimmy", "mujoco"}) <= of_sb3
+    assert not loaded & extras
+
+
+SECONDS = """
+import resource, sys
+exec(sys.argv[1])
+used = resource.getrusage(resource.RUSAGE_SELF)
+print(used.ru_utime + used.ru_stime)
+"""
+
+
+def seconds(statement: str) -> float:
+    """Processor time of a process that imports something: on a busy machine that is steadier than the clock's."""
+    command = [sys.executable, "-c", SECONDS, statement]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_importing_takes_little_longer_than_importing_sb3() -> None:
+    statements = ("import stable_baselines3", "from sb3_crc import *", "import sb3_crc", "import time; time.sleep(0)")
+    rounds = [[seconds(statement) for statement in statements] for _ in range(7)]
+    sb3, names, package, nothing = (statistics.median(column) for column in zip(*rounds, strict=True))
+    print(
+        f"seconds of import: stable_baselines3 {sb3:.2f}, all names {names:.2f}, sb3_crc {package:.2f}, nothing {nothing:.2f}"
+    )
+    assert names <= 1.2 * sb3
+    assert package <= 0.5 * sb3
+    assert nothing < 0.5 * sb3  # the measure tells something from nothing
