@@ -76,7 +76,7 @@ gym.register("own/CentreTheDisc-v0", CentreTheDisc, max_episode_steps=50)
 def main(arguments: list[str] | None = None) -> CRCSAC:
     """Train for a moment in it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--agent-steps", type=int, default=250, help="decisions; 5000 are enough to see it learn")
+    parser.add_argument("--agent-steps", type=int, default=250, help="decisions, each of which is an environment step")
     options = parser.parse_args(arguments)
     env = TimeLimit(CentreTheDisc(), 50)
     model = CRCSAC("CnnPolicy", env, augmentation="random_shift", learning_starts=100, batch_size=32, verbose=1, seed=0)

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_crc import CRCSAC
 from sb3_crc.augmentations import AUGMENTATIONS, bind_augmentation
 from sb3_crc.crc_sac import CHOICES
-from tests.conftest import POLICY_KWARGS, make_model
+from tests.conftest import make_model
 from tests.docs.fences import ROOT
 
 #: Decisions of each, of which the last few are followed by updates
@@ -96,28 +96,3 @@ def test_the_environment_is_one(module: ModuleType) -> None:
 
     model = trained(module)
     assert model.replay_buffer.frame_channels == 3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("module", ["own_environment"], indirect=True)
-def test_something_can_be_learned_in_it(module: ModuleType) -> None:
-    """Mean reward of a step: about -0.8 by random actions, above -0.4 where the disc is brought to the middle."""
-    env = gym.make("own/CentreTheDisc-v0")
-    model = CRCSAC(
-        "CnnPolicy",
-        env,
-        objectives={},
-        augmentation="random_shift",
-        augmentation_kwargs={"pad": 1},
-        learning_starts=200,
-        batch_size=64,
-        policy_kwargs=POLICY_KWARGS,
-        seed=0,
-    )
-    model.learn(3_000)
-    observation, _ = env.reset(seed=7)
-    rewards = []
-    for _ in range(50):
-        observation, reward, *_ = env.step(model.predict(observation, deterministic=True)[0])
-        rewards.append(float(reward))
-    assert np.mean(rewards) > -0.4
