@@ -30,7 +30,7 @@ CROP_RATIO = 0.84
 
 #: Argument -> what it may be
 CHOICES = {
-    "augmentation": tuple(AUGMENTATIONS),
+    "augmentation": AUGMENTATIONS,
     "anchor": ("augmented", "center_crop"),
     "balance": ("none", "grad_norm"),
     "precision": tuple(PRECISIONS),

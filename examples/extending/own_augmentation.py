@@ -11,7 +11,6 @@ import torch as th
 
 from sb3_crc import CRCSAC, make_dmc
 from sb3_crc.augmentations import AUGMENTATIONS
-from sb3_crc.crc_sac import CHOICES
 
 
 def random_cutout(images: th.Tensor, side: int = 12) -> th.Tensor:
@@ -32,7 +31,6 @@ def random_cutout(images: th.Tensor, side: int = 12) -> th.Tensor:
 
 
 AUGMENTATIONS["random_cutout"] = random_cutout
-CHOICES["augmentation"] = tuple(AUGMENTATIONS)  # the names that CRCSAC takes
 
 
 def main(arguments: list[str] | None = None) -> CRCSAC:

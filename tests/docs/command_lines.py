@@ -20,7 +20,6 @@ import typer
 from stable_baselines3 import SAC
 
 from sb3_crc.augmentations import AUGMENTATIONS
-from sb3_crc.crc_sac import CHOICES
 from sb3_crc.presets import PRESETS
 from sb3_crc.stock import STOCK
 from tests.docs.fences import ROOT
@@ -263,7 +262,6 @@ def check_script(words: list[str]) -> None:
         mock.patch.object(sys, "argv", words),
         mock.patch.object(sys, "path", [str((ROOT / words[0]).parent), *sys.path]),
         mock.patch.dict(AUGMENTATIONS),  # an example registers its own
-        mock.patch.dict(CHOICES),
         mock.patch.dict(gym.registry),
     ):
         options_of(lambda: runpy.run_path(str(ROOT / words[0]), run_name="__main__"))

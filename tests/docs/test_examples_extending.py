@@ -13,7 +13,6 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_crc import CRCSAC
 from sb3_crc.augmentations import AUGMENTATIONS, bind_augmentation
-from sb3_crc.crc_sac import CHOICES
 from tests.conftest import make_model
 from tests.docs.fences import ROOT
 
@@ -25,7 +24,7 @@ BUDGET = ["--agent-steps", "103"]
 def module(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """The example that the test names; what it registers is gone after the test."""
     monkeypatch.syspath_prepend(ROOT / "examples" / "extending")
-    with mock.patch.dict(AUGMENTATIONS), mock.patch.dict(CHOICES):
+    with mock.patch.dict(AUGMENTATIONS):
         yield importlib.import_module(request.param)
 
 
@@ -59,7 +58,6 @@ def test_the_augmentation_hides_one_square(module: ModuleType) -> None:
     assert len(cut.unique(dim=0)) > 40  # places differ
     many = module.random_cutout(th.zeros(200, 1, 6, 6, dtype=th.uint8), side=5)
     assert many[:, 0, 0, 0].any() and many[:, 0, -1, -1].any()  # ends included
-    CHOICES["augmentation"] = tuple(AUGMENTATIONS)
     trained(module)
 
 
