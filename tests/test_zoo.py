@@ -1,5 +1,6 @@
 """The zoo with our algorithms, on real dm_control."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_crc import CRCSAC, PRESETS, QBiasEvalCallback
 from sb3_crc.zoo import CRCExperimentManager, preset_class, register
+from sb3_crc.zoo.resume import Plan
 from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 ROOT = Path(__file__).parent.parent
@@ -184,6 +186,47 @@ def test_an_interrupted_film_leaves_the_one_before(tmp_path: Path, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         manager._film(model, model.env)
     assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [("policy.mp4", b"film")]
+
+
+@pytest.mark.parametrize("checkpoints", [True, False])
+def test_a_disk_that_is_full_at_the_end_is_said_with_what_holds_the_training(
+    checkpoints: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0)
+    manager.n_timesteps, manager.plan = 10, Plan([], 5 if checkpoints else None, None)
+    monkeypatch.setattr(sys, "orig_argv", ["python", "train.py", "--algo", "crc"])
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    model = make_model()
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(model, "save", full)
+    with pytest.raises(SystemExit) as stopped:
+        manager.save_trained_model(model)
+    first, last = str(stopped.value).splitlines()
+    assert first == f"The model could not be saved in {manager.save_path}: [Errno 28] No space left on device"
+    resume = f"When the disk is writable again, from the last checkpoint: python train.py --resume {manager.save_path}"
+    assert last == (resume if checkpoints else "Without --checkpoint-every nothing else holds the training.")
+
+
+def test_a_film_that_does_not_fit_costs_no_more_than_the_film(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0)
+    manager.n_timesteps, manager.normalize = 0, False
+    Path(manager.save_path).mkdir(parents=True)
+    model = make_model()
+    monkeypatch.setattr(sys, "orig_argv", ["python", "train.py"])
+    monkeypatch.setattr(manager, "create_envs", lambda *args, **kwargs: model.env)
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("sb3_crc.zoo.manager.film", full)
+    manager.save_trained_model(model)
+    assert "could not be written: [Errno 28] No space left on device" in caplog.text
+    assert (Path(manager.save_path) / f"{manager.env_name}.zip").exists() and "Training finished" in capsys.readouterr().out
 
 
 class InterruptedEnv(NoiseEnv):
