@@ -1,7 +1,9 @@
 """Tiny image environments and models, so that a test takes a second."""
 
+import shutil
 import signal
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -107,3 +109,16 @@ def repeatable() -> None:
     th.set_num_threads(1)
     th.manual_seed(0)
     np.random.seed(0)
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Debian's Chromium, driven by Playwright; without one nothing can be shown."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("no Chromium")
+    with sync_api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        yield launched
+        launched.close()

@@ -1,10 +1,8 @@
 """The site as ``make docs`` builds it: no warning, no network, and pages that show what they should."""
 
 import re
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,18 +55,6 @@ def test_what_the_site_holds(site: Path) -> None:
     assert "update.json" in (site / "docs" / "performance.html").read_text()
     extending = (site / "docs" / "extending.html").read_text()
     assert all(name in extending for name in ("InverseDynamics", "random_cutout", "KeypointEncoder", "CentreTheDisc"))
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        pytest.skip("no Chromium")
-    with sync_api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-        yield launched
-        launched.close()
 
 
 def test_pages_in_a_browser(site: Path, browser: Any) -> None:
