@@ -53,8 +53,12 @@ RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 
 def check_ranges(model: object) -> None:
-    """:raises ValueError: for the first attribute of ``model`` that is out of its range"""
+    """:raises ValueError: for the first attribute of ``model`` that is out of its range, or no number"""
     for name, (allows, words) in RANGES.items():
         value = getattr(model, name)
-        if not allows(value):
-            raise ValueError(f"{name}={value} must be {words}")
+        try:
+            allowed = allows(value)
+        except TypeError:  # a string, None
+            allowed = False
+        if not allowed:
+            raise ValueError(f"{name}={value!r} must be {words}")

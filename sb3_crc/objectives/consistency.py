@@ -40,8 +40,8 @@ class Consistency(AuxiliaryObjective):
     :param predictor_side: ``"key"``: h(s') predicts s, as the paper writes: from the key encoder's latent of the positive the
         online latent of the anchor, through which alone the encoder receives gradient; ``"online"``: h(s) predicts
         the key encoder's latent of ``target``, as the released code does (and SODA, arXiv 2011.13389)
-    :param target: with the predictor on the online side: ``"clean"``, the middle of the frame (the released code), or
-        ``"positive"``, which is augmented like what the critic sees (SODA)
+    :param target: with the predictor on the online side, and only there: ``"clean"``, the middle of the frame (the released
+        code; None is this too), or ``"positive"``, which is augmented like what the critic sees (SODA)
     :param predictor: ``"layer_norm"``: Linear, LayerNorm, ReLU, Linear; ``"batch_norm"``: Linear, BatchNorm, ReLU twice, then
         Linear (the released code)
     :param hidden_dim: width of the predictor
@@ -56,7 +56,7 @@ class Consistency(AuxiliaryObjective):
         action_dim: int,
         *,
         predictor_side: str = "key",
-        target: str = "clean",
+        target: str | None = None,
         predictor: str = "layer_norm",
         hidden_dim: int = 128,
         normalize: bool = False,
@@ -64,11 +64,14 @@ class Consistency(AuxiliaryObjective):
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
         check_name("consistency: predictor_side", predictor_side, SIDES)
-        check_name("consistency: target", target, TARGETS)
+        if target is not None:
+            check_name("consistency: target", target, TARGETS)
+            if predictor_side == "key":
+                raise ValueError(f"consistency: target={target!r} needs predictor_side='online': with 'key' it is the anchor")
         check_name("consistency: predictor", predictor, PREDICTORS)
         check_name("consistency: reduction", reduction, REDUCTIONS)
         self.predictor_side = predictor_side
-        self.target = target
+        self.target = target or "clean"
         self.normalize = normalize
         self.reduction = reduction
         norm, hidden_layers = (nn.LayerNorm, 1) if predictor == "layer_norm" else (nn.BatchNorm1d, 2)

@@ -205,6 +205,7 @@ def test_an_own_objective_is_found_by_its_dotted_path() -> None:
         ({"contrastive": {"margin": 1}}, "weight.*None"),
         ({"contrastive": {"weight": 1, "margin": 1}}, "no setting 'margin'.*weight"),
         ({"consistency": {"weight": 1, "hiden_dim": 1}}, "no setting 'hiden_dim'.*hidden_dim"),
+        ({"consistency": {"weight": 1, "target": "positive"}}, "target='positive' needs predictor_side='online'"),
         ({"contrastive": 0.0, "consistency": 0}, "all weights.*objectives={}"),
         ({"no.such.Loss": 1.0}, "cannot be imported"),
         ({"math.sqrt": 1.0}, "subclass of AuxiliaryObjective"),
