@@ -17,26 +17,35 @@ def operations(work: Callable[[], object]) -> int:
     return counter.total
 
 
-def matrix_peak(size: int = 2048, repeats: int = 10) -> float:
+def matrix_peak(size: int = 2048, repeats: int = 10, dtype: th.dtype = th.float32, device: str = "cpu") -> float:
     """
-    :param size: of the square float32 matrices
+    :param size: of the square matrices
     :param repeats: of which the median counts
-    :return: operations per second of the faster of torch's two matrix products, MKL's and oneDNN's
+    :param dtype: of their numbers
+    :param device: that multiplies them
+    :return: operations per second; on a CPU, for float32, of the faster of torch's two matrix products, MKL's and oneDNN's
     """
-    left, right = th.randn(size, size), th.randn(size, size)
+    left, right = (th.randn(size, size, device=device).to(dtype) for _ in range(2))
     products: list[Callable[[], object]] = [lambda: left @ right]
-    if th.backends.mkldnn.is_available():
+    if device == "cpu" and dtype == th.float32 and th.backends.mkldnn.is_available():
         products.append(lambda: th.ops.mkldnn._linear_pointwise(left, right, None, "none", [], ""))
     rates = []
     for product in products:
-        product()
+        finish(product())
         seconds = []
         for _ in range(repeats):
             start = time.perf_counter()
-            product()
+            finish(product())
             seconds.append(time.perf_counter() - start)
         rates.append(2 * size**3 / statistics.median(seconds))
     return max(rates)
+
+
+def finish(result: object) -> object:
+    """Wait until a GPU, if there is one, has done what was asked of it. :return: ``result``"""
+    if th.cuda.is_available():
+        th.cuda.synchronize()
+    return result
 
 
 class _Counter(TorchDispatchMode):

@@ -11,7 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.end_to_end import TASK
-from benchmarks.flops import operations
+from benchmarks.flops import finish, matrix_peak, operations
 from benchmarks.interleave import Work, in_fresh_process, interleave
 from benchmarks.networks import NETWORKS
 from benchmarks.peers import stock_sac
@@ -59,7 +59,7 @@ def measure(
     programs[LAYOUT, "float32"] = partial(stock, *setting, channels_last=True)
     named = {" ".join(name): program for name, program in programs.items()}
     seconds = interleave(named, repeats=repeats, on_round=on_round)
-    peak = in_fresh_process(partial(matrix_peak, th.bfloat16))
+    peak = in_fresh_process(partial(matrix_peak, 8192, 20, th.bfloat16, "cuda"))
     rows = []
     for (method, form), program in programs.items():
         name = f"{method} {form}"
@@ -151,29 +151,9 @@ def stock(networks: str, batch_size: int, *, channels_last: bool, device: str = 
     return lambda: finish(model.train(UPDATES, batch_size))
 
 
-def finish(result: object) -> object:
-    """Wait until the GPU has done what was asked of it. :return: ``result``"""
-    if th.cuda.is_available():
-        th.cuda.synchronize()
-    return result
-
-
 def memory_and_operations(program: Callable[[], Work]) -> tuple[float, float]:
     """:return: gigabytes that torch took for the program, and operations of one update that is launched piece by piece"""
     work = program()
     work()
     gigabytes = th.cuda.max_memory_reserved() / 1e9 if th.cuda.is_available() else 0.0
     return gigabytes, operations(work) / UPDATES
-
-
-def matrix_peak(dtype: th.dtype, size: int = 8192, repeats: int = 20) -> float:
-    """:return: operations per second of a product of square matrices"""
-    device = "cuda" if th.cuda.is_available() else "cpu"
-    left, right = (th.randn(size, size, device=device).to(dtype) for _ in range(2))
-    seconds = []
-    for _ in range(repeats):
-        finish(None)
-        start = time.perf_counter()
-        finish(left @ right)
-        seconds.append(time.perf_counter() - start)
-    return 2 * size**3 / statistics.median(seconds[1:])

@@ -7,7 +7,8 @@ import torch as th
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app
-from benchmarks.gpu import FORMS, UPDATES, WAYS, matrix_peak, memory_and_operations, ours, seconds_per_decision, stock
+from benchmarks.flops import matrix_peak
+from benchmarks.gpu import FORMS, UPDATES, WAYS, memory_and_operations, ours, seconds_per_decision, stock
 from benchmarks.update import count
 from benchmarks.update import ours as on_cpu
 
@@ -22,7 +23,7 @@ def test_stock_is_timed_over_as_many_updates() -> None:
     model = partial(stock, "laptop", 8, channels_last=True, device="cpu")
     _, needed = memory_and_operations(model)
     assert needed > 0 and UPDATES % 2 == 0
-    assert matrix_peak(th.float32, size=64, repeats=3) > 0
+    assert matrix_peak(64, 3, th.bfloat16) > 0
 
 
 @pytest.mark.parametrize("way", WAYS)
