@@ -33,7 +33,7 @@ SMALL: dict[str, Any] = {
 
 def make_reacher(seed: int) -> gym.Env[Observation, np.ndarray]:
     """
-    Small pictures, drawn fast: for scores that are to be compared, leave both away. Any wrapper of Gymnasium may follow; with
+    Small pictures, drawn fast: for scores that are to be compared, leave both out. Any wrapper of Gymnasium may follow; with
     ``render_mode=None`` nothing is drawn for people.
     """
     env = make_dmc("reacher-easy", seed=seed, observation="dict", image_size=40, render_quality="fast")

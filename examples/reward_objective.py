@@ -1,6 +1,6 @@
 """A loss of your own, in one class: which reward will this action bring?
 
-Latents that can answer hold what matters to the task, and may leave the scenery away (UNREAL, arXiv 1611.05397, section 3.3).
+Latents that can answer hold what matters to the task, and may leave out the scenery (UNREAL, arXiv 1611.05397, section 3.3).
 The class says what is computed; optimizer, device, train and eval mode, saving and logging follow. It goes by its dotted path,
 in Python and in a configuration alike. Keys beside ``weight`` are arguments of its constructor:
 
