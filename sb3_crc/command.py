@@ -12,6 +12,7 @@ A parameter whose type is a dataclass stands for its fields, which are options: 
 """
 
 import errno
+import importlib.util
 import json
 import math
 import signal
@@ -76,6 +77,24 @@ def command(
         return function
 
     return register
+
+
+def separated(names: str) -> list[str]:
+    """:param names: separated by commas; :return: them, without the spaces around them"""
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def require(extra: str, *packages: str) -> None:
+    """
+    Ask for what a command needs before it works for hours.
+
+    :param extra: of this package, which brings them
+    :param packages: to be imported later
+    :raises ValueError: if one is not installed, naming the extra
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(f"this needs {package}, of the extra '{extra}': pip install 'sb3-crc[{extra}]'")
 
 
 def as_json(document: object) -> str:
@@ -166,6 +185,11 @@ def _one_line_for_mistakes() -> Iterator[None]:
         tell(_line(error))
         raise typer.Exit(NO) from None
     except ValueError as error:
+        tell(str(error))
+        raise typer.Exit(MISUSED) from None
+    except ImportError as error:
+        if error.name is not None:  # Python's own, not a library's sentence about a missing extra
+            raise
         tell(str(error))
         raise typer.Exit(MISUSED) from None
     except RuntimeError as error:

@@ -36,7 +36,14 @@ def several_of(*names: str) -> Complete:
 
 
 def distractions(incomplete: str) -> list[str]:
-    """Modes of ``generalize`` and ``contact-sheet``, separated by commas."""
+    """Those of ``contact-sheet``, separated by commas."""
+    from sb3_crc.envs.distractions.modes import DISTRACTIONS
+
+    return several_of(*DISTRACTIONS)(incomplete)
+
+
+def modes(incomplete: str) -> list[str]:
+    """Those of ``generalize``, separated by commas: distractions, and none of them."""
     from sb3_crc.envs.distractions.modes import DISTRACTIONS
 
     return several_of("none", *DISTRACTIONS)(incomplete)

@@ -1,6 +1,6 @@
-"""Commands that look into saved models: ``sb3-crc latents | tsne | correlate | probe | film | generalize``."""
+"""Commands that look into saved models, ``sb3-crc latents | tsne | correlate | probe | film | generalize``, and at what
+distractions show, ``contact-sheet``."""
 
-import importlib.util
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from sb3_crc import completion
-from sb3_crc.command import Group, command
+from sb3_crc.command import Group, command, require, separated
 from sb3_crc.console import say, tell
 
 app = typer.Typer()
@@ -51,7 +51,7 @@ def latents(
     """Roll policies and keep latents, actions, frames, physics, values and returns in analysis/ of their runs."""
     from sb3_crc.analysis.latent_report import write_latents
 
-    subjects = _gather(models, checkpoints, rollouts, needs=("matplotlib",))
+    subjects = _gather(models, checkpoints, rollouts)
     with _timed("latents"):
         written = write_latents(subjects, output)
     return _listed(written)
@@ -72,7 +72,8 @@ def tsne(
     """Draw latents in the plane, coloured by clusters of the actions, and measure how pure the clusters are."""
     from sb3_crc.analysis.cluster_report import write_clusters
 
-    subjects = _gather(models, checkpoints, rollouts, needs=("sklearn", "plotly", "matplotlib"))
+    require("analysis", "sklearn", "plotly")
+    subjects = _gather(models, checkpoints, rollouts)
     with _timed("tsne"):
         written = write_clusters(subjects, output, clusters=clusters, neighbours=neighbours)
     return _listed(written)
@@ -97,7 +98,7 @@ def correlate(
     """Compare latents of the same observations: the paper's heat map, CKA and CCA, beside two seeds of one method."""
     from sb3_crc.analysis.similarity_report import write_similarities
 
-    subjects = _gather([*models, *(null or [])], checkpoints, rollouts, needs=("matplotlib",))
+    subjects = _gather([*models, *(null or [])], checkpoints, rollouts)
     with _timed("correlate"):
         written = write_similarities(subjects, output, states=states)
     return _listed(written)
@@ -116,7 +117,7 @@ def probe(
     """Read the physics state off the latents by ridge regression, beside an untrained encoder and a PCA of the pixels."""
     from sb3_crc.analysis.probe_report import write_probes
 
-    subjects = _gather(models, checkpoints, rollouts, needs=("matplotlib",))
+    subjects = _gather(models, checkpoints, rollouts)
     with _timed("probe"):
         written = write_probes(subjects, output, states=states, own_states=own_states)
     return _listed(written)
@@ -138,7 +139,8 @@ def film(
 
     if len(find_policies([model])) > 1:
         raise ValueError(f"{model} contains several runs; a film is of one model")
-    (subject,) = _gather([model], False, rollouts, needs=("av", "matplotlib"))
+    require("video", "av")
+    (subject,) = _gather([model], False, rollouts)
     with _timed("film"):
         written = write_film(subject, output, episode=episode)
     return _listed(written)
@@ -149,9 +151,7 @@ def generalize(
     models: Models,
     modes: Annotated[
         str,
-        typer.Option(
-            help="Distractions, separated by commas; none: where it was trained.", autocompletion=completion.distractions
-        ),
+        typer.Option(help="Distractions, separated by commas; none: where it was trained.", autocompletion=completion.modes),
     ] = "none,color_easy,color_hard,video_easy,video_hard",
     data: Data = None,
     evaluation_episodes: Annotated[int, typer.Option("--episodes", min=1, help="Episodes in each mode.")] = 10,
@@ -163,7 +163,8 @@ def generalize(
     from sb3_crc.analysis.generalization_report import Generalization, write_generalization
     from sb3_crc.analysis.policies import find_policies
 
-    names = [name.strip() for name in modes.split(",") if name.strip()]
+    require("analysis", "matplotlib")
+    names = separated(modes)
     evaluated = []
     for policy in find_policies(models, checkpoints=checkpoints):
         results = evaluate(policy, names, data=data, episodes=evaluation_episodes, report=tell)
@@ -200,17 +201,15 @@ def contact_sheet(
     from sb3_crc.analysis.contact_sheet import MODES, draw_contact_sheet
     from sb3_crc.envs.tasks import PAPER_TASKS
 
-    chosen = [PAPER_TASKS if tasks is None else tasks.split(","), MODES if modes is None else modes.split(",")]
+    require("analysis", "matplotlib")
+    chosen = [PAPER_TASKS if tasks is None else separated(tasks), MODES if modes is None else separated(modes)]
     return _listed([draw_contact_sheet(output, *chosen, data=data, render_quality=render_quality)])
 
 
-def _gather(models: Sequence[Path], checkpoints: bool, rollouts: Rollouts, *, needs: Sequence[str]) -> list[Any]:
+def _gather(models: Sequence[Path], checkpoints: bool, rollouts: Rollouts) -> list[Any]:
     from sb3_crc.analysis.subjects import gather
 
-    for package in needs:
-        if importlib.util.find_spec(package) is None:
-            extra = "video" if package == "av" else "analysis"
-            raise ValueError(f"this needs {package}, of the extra '{extra}': pip install 'sb3-crc[{extra}]'")
+    require("analysis", "matplotlib")
     with _timed("rollouts"):
         return gather(models, checkpoints=checkpoints, **asdict(rollouts), report=tell)
 

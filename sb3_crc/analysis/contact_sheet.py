@@ -30,15 +30,18 @@ def draw_contact_sheet(
     """
     Draw one frame of each task (rows) and each mode (columns), beside the task as it is; the agent acts at random.
 
-    :param path: PNG file to write
+    :param path: PNG file to write, in a folder that is made
     :param tasks: domain-task
     :param modes: distractions of :func:`~sb3_crc.make_dmc`
     :param data: see its ``distraction_data``
     :param image_size: side of the pictures in pixels
     :param env_kwargs: others of its arguments
     :return: the path
-    :raises ValueError: for an unknown task or mode
+    :raises ValueError: for an unknown task or mode, or no task at all
     """
+    if not tasks:
+        raise ValueError("no task is given: there is nothing to draw")
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure = new_figure(1.25 * (len(modes) + 1), 1.3 * len(tasks) + 0.3)
     grid = figure.subplots(len(tasks), len(modes) + 1, squeeze=False)
     for row, task in zip(grid, tasks, strict=True):

@@ -40,6 +40,7 @@ def test_commands_and_options() -> None:
         ("sb3-crc compare --presets crc,crc", ["crc,crc_release"]),
         ("sb3-crc compare --engine ", ["local", "ray", "slurm"]),
         ("sb3-crc generalize --modes none,video", ["none,video_easy", "none,video_hard"]),
+        ("sb3-crc contact-sheet --modes n", []),
         ("sb3-crc table ", ["100k", "500k"]),
         ("sb3-crc table 100k runs --format l", ["latex"]),
         ("sb3-crc ladder s", ["state", "seen"]),
@@ -52,7 +53,8 @@ def test_values(line: str, expected: list[str]) -> None:
 
 def test_names_are_those_of_the_library() -> None:
     assert set(completion.methods("")) == {*PRESETS, *STOCK}
-    assert set(completion.distractions("")) == {"none", *DISTRACTIONS}
+    assert set(completion.distractions("")) == {*DISTRACTIONS}
+    assert set(completion.modes("")) == {"none", *DISTRACTIONS}
 
 
 def test_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,6 +117,7 @@ def test_values_that_cannot_be(name: str) -> None:
         (["ladder", "stairs"], "'stairs' is none of state, seen, probe, teach, overfit"),
         (["table", "200k", "{csv}"], "200k"),
         (["contact-sheet", "--tasks", "cartpole"], "Unknown task 'cartpole'"),
+        (["contact-sheet", "--tasks", " ,"], "no task is given"),
         (["contact-sheet", "--tasks", "lqr-lqr_2_1", "--render-quality", "best"], "best"),
         (["compare", "--task", "walker-walk", "--engine", "lcoal"], "did you mean 'local'?"),
         (["compare", "--task", "walker-walk", "--presets", "crcc"], "did you mean 'crc'?"),
@@ -150,6 +151,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
         (RenderingUnavailable("nothing draws"), 1, "nothing draws"),
         (PermissionError(errno.EACCES, "Permission denied", "x.csv"), 2, "x.csv: Permission denied"),
         (ValueError("seed=-1 must be at least 0"), 2, "seed=-1 must be at least 0"),
+        (ImportError("a.mp4 needs the package av: pip install it"), 2, "a.mp4 needs the package av: pip install it"),
         (KeyboardInterrupt(), 130, "Stopped."),
     ],
 )
@@ -186,7 +188,8 @@ def test_a_signal_ends_a_command_with_its_number(signum: signal.Signals) -> None
     assert (done.returncode, done.stderr, done.stdout) == (128 + signum, "tidied up\nStopped.\n", "")
 
 
-def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(baselines, "measure_baselines", raising(TypeError("a bug")))
+@pytest.mark.parametrize("error", [TypeError("a bug"), ModuleNotFoundError("No module named 'sb3'", name="sb3")])
+def test_a_bug_keeps_its_traceback(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "measure_baselines", raising(error))
     done = CliRunner().invoke(app, BASELINES)
-    assert done.exit_code == 1 and isinstance(done.exception, TypeError)
+    assert done.exit_code == 1 and done.exception is error
