@@ -1,6 +1,6 @@
 """What ``sb3-crc tsne`` writes: latents in the plane, coloured by clusters of actions, and how pure the clusters are."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,9 +45,7 @@ class Clustered:
     rows: list[dict[str, Any]]
 
 
-def write_clusters(
-    subjects: Sequence[Subject], folder: Path, *, clusters: int, neighbours: int, report: Callable[[str], None] = print
-) -> list[Path]:
+def write_clusters(subjects: Sequence[Subject], folder: Path, *, clusters: int, neighbours: int) -> list[Path]:
     """
     Write ``tsne.png``, ``tsne.html``, ``tsne.csv``, ``tsne.json`` and ``tsne.md``; of several models of one run
     ``tsne_evolution.png`` too.
@@ -56,7 +54,6 @@ def write_clusters(
     :param folder: to write to
     :param clusters: of the actions
     :param neighbours: for the purity
-    :param report: is told what is written before the slow part
     :return: what was written
     :raises ValueError: if there are too few samples for the clusters or for the neighbours
     """

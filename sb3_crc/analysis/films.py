@@ -1,5 +1,10 @@
-"""Films of policies."""
+"""Films of policies.
 
+H, W height and width of a picture.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,30 +19,56 @@ def film(model: PolicyPredictor, environment: VecEnv, path: Path, *, max_decisio
 
     :param model: any SB3 model, or a policy
     :param environment: one environment that renders ``rgb_array`` and knows its ``render_fps``
-    :param path: the file to write, H.264 if it ends in .mp4
+    :param path: the file to write, for instance .mp4
     :param max_decisions: stop filming after so many
     :return: the return of the episode so far
     :raises ImportError: without the package ``av`` (extra ``video``)
+    :raises ValueError: if the environment renders no pictures, or PyAV knows no format of the file's suffix
     """
-    import av
-
     fps = float(environment.metadata.get("render_fps", 30))  # type: ignore[arg-type]
     observation = environment.reset()
     total = 0.0
-    height, width = (side - side % 2 for side in _picture(environment).shape[:2])  # the codec takes even sides only
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    with film_file(path, fps) as add:
         for _ in range(max_decisions):
-            picture = np.ascontiguousarray(_picture(environment)[:height, :width])
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            add(_picture(environment))
             action, _ = model.predict(observation, deterministic=True)  # type: ignore[arg-type]
             observation, rewards, dones, _ = environment.step(action)
             total += float(rewards[0])
             if dones[0]:
                 break
-        container.mux(stream.encode())
     return total
+
+
+@contextmanager
+def film_file(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+    """
+    A film in H.264, complete when the context ends.
+
+    :param path: the file to write; its suffix names the container
+    :param fps: pictures per second
+    :return: a function that adds a picture, uint8 ``(H, W, 3)``, all of one size; an odd last row or column is cut off
+    :raises ImportError: without the package ``av`` (extra ``video``)
+    :raises ValueError: if PyAV knows no format of the file's suffix
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError("films need the package av: pip install 'sb3-crc[video]'") from error
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        stream.pix_fmt = "yuv420p"
+        sides: list[int] = []
+
+        def add(picture: np.ndarray) -> None:
+            if not sides:
+                sides.extend(side - side % 2 for side in picture.shape[:2])  # the codec takes even sides only
+                stream.height, stream.width = sides
+            even = np.ascontiguousarray(picture[: sides[0], : sides[1]])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+
+        yield add
+        container.mux(stream.encode())
 
 
 def _picture(environment: VecEnv) -> np.ndarray:

@@ -3,12 +3,12 @@
 T decisions, H, W height and width, Z latent.
 """
 
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_crc.analysis.films import film_file
 from sb3_crc.analysis.networks import reconstruct
 from sb3_crc.analysis.saliency import q_saliency, saliency_on_motion
 from sb3_crc.analysis.subjects import Subject
@@ -185,16 +185,9 @@ def _composed(background: np.ndarray, boxes: Any, cursor: Any, panels: dict[str,
 
 
 def _write_video(pictures: list[np.ndarray], path: Path, fps: float) -> Path:
-    import av
-
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-        height, width = (side - side % 2 for side in pictures[0].shape[:2])  # the codec takes even sides only
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    with film_file(path, fps) as add:
         for picture in pictures:
-            even = np.ascontiguousarray(picture[:height, :width])
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
-        container.mux(stream.encode())
+            add(picture)
     return path
 
 
