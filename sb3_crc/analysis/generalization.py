@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_crc.analysis.policies import SavedPolicy
-from sb3_crc.analysis.rollouts import FOLDER
+from sb3_crc.analysis.rollouts import FOLDER, make_environment
 from sb3_crc.atomic import atomic_write
 from sb3_crc.checkpoints.store import checksum
 from sb3_crc.envs.distractions import DISTRACTIONS
@@ -88,7 +88,7 @@ def generalize(
     measured: dict[str, Any] = known.get("modes", {}) if {name: known.get(name) for name in about} == about else {}
     model, results = None, []
     for mode in modes:
-        env = Monitor(gym.make(run.arguments["env"], **{**run.env_kwargs, "seed": FIRST_SEED, **_distraction(mode, data)}))
+        env = Monitor(make_environment(run, FIRST_SEED, **_distraction(mode, data)))
         try:
             label = _label(env, mode)
             if label not in measured:

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from sb3_crc.experiments.runs import Run
 
 #: What must be known to read DMControl-GB's figures beside ours
 UNITS = (
-    "Published figures: DMControl-GB trains for '500k frames', which in its code are agent steps, at its action repeat of 4 "
-    "2 000 000 environment steps; ours have seen as many as the table says. Frames of 100 x 100 cropped to 84 x 84; ± is over "
+    "Published figures: DMControl-GB trains for '500k frames', which in its code are agent steps: 2 000 000 environment steps "
+    "at its action repeat of 4; ours have seen as many as the table says. Frames of 100 x 100 cropped to 84 x 84; ± is over "
     "five seeds.",
     "video_hard and SGQN: the SGQN authors' own runs.",
 )
+PUBLISHED = "Published:"
 COLUMNS = ("policy", "method", "task", "seed", "environment_steps", "mode", "shown", "episode", "return")
 
 
@@ -55,7 +57,10 @@ def write_generalization(evaluated: Sequence[Generalization], folder: Path) -> l
     for task, own in by_task.items():
         lines += _task_lines(task, own)
     shown = dict.fromkeys(result.label for one in evaluated for result in one.results if result.mode != NONE)
-    lines += ["", f"Shown: {', '.join(shown)}.", "", *(f"{note}\n" for note in UNITS)]
+    if shown:
+        lines += ["", f"Shown: {', '.join(shown)}."]
+    if PUBLISHED in lines:
+        lines += ["", *(f"{note}\n" for note in UNITS)]
     written.append(write_lines(lines, folder / "generalization.md"))
     written.append(_draw_bars(by_task, folder / "generalization.png"))
     curves = _draw_curves([one.policy.run for one in evaluated], folder / "over_training.png")
@@ -114,7 +119,7 @@ def _task_lines(task: str, own: Sequence[Generalization]) -> list[str]:
         methods = list(dict.fromkeys(row["method"] for row in published))
         table = [[method, *(at.get((method, mode), "-") for mode in kinds)] for method in methods]
         sources = dict.fromkeys(row["source"] for row in published)
-        lines += ["", "Published:", "", *markdown(["method", *kinds], table), "", f"Sources: {'; '.join(sources)}."]
+        lines += ["", PUBLISHED, "", *markdown(["method", *kinds], table), "", f"Sources: {'; '.join(sources)}."]
     return lines
 
 
@@ -149,7 +154,7 @@ def _draw_bars(by_task: Mapping[str, Sequence[Generalization]], path: Path) -> P
 
 
 def _draw_curves(runs: Sequence[Run], path: Path) -> Path | None:
-    """The paper's plot: a row per task, a column per mode, a line per method: mean and range of its trainings."""
+    """The paper's plot: a row per task, a column per mode, a line per method: mean and range where all its trainings are."""
     found: dict[str, dict[str, dict[str, list[tuple[np.ndarray, np.ndarray]]]]] = {}
     for run in {run.folder: run for run in runs}.values():
         records = read_records(run.folder)
@@ -165,9 +170,8 @@ def _draw_curves(runs: Sequence[Run], path: Path) -> Path | None:
     for row, (task, own) in zip(grid, found.items(), strict=True):
         for axes, mode in zip(row, modes, strict=True):
             for number, (method, curves) in enumerate(own.get(mode, {}).items()):
-                common = min(len(steps) for steps, _ in curves)
-                returns = np.stack([values[:common] for _, values in curves])
-                steps = curves[0][0][:common]
+                steps = reduce(np.intersect1d, (own_steps for own_steps, _ in curves))
+                returns = np.stack([values[np.isin(own_steps, steps)] for own_steps, values in curves])
                 axes.plot(steps, returns.mean(axis=0), color=f"C{number}", label=f"{method} ({len(curves)})", marker=".")
                 axes.fill_between(steps, returns.min(axis=0), returns.max(axis=0), color=f"C{number}", alpha=0.15)
             axes.set_title(f"{task}, {mode}")

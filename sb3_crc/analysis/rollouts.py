@@ -35,6 +35,8 @@ FOLDER = "analysis"
 #: Of the files; another one is collected anew
 FORMAT = 1
 LONGEST_EPISODE = 10_000
+#: Settings by which rl_zoo3 puts wrappers around an environment
+WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def rollout_of(
     :param seed: of the environment, from which all its episodes follow
     :param report: is told where the rollout comes from and how long that took
     :return: the rollout
-    :raises ValueError: if the policy cannot act in the environment of its run
+    :raises ValueError: if the policy cannot act in the environment of its run, or that is wrapped by rl_zoo3
     """
     settings = {
         "format": FORMAT,
@@ -135,12 +137,21 @@ def rollout_of(
     return rollout
 
 
-def make_environment(run: Run, seed: int) -> gym.Env[Any, Any]:
-    """:param run: whose environment; :param seed: of it; :return: the environment that the run was trained in"""
+def make_environment(run: Run, seed: int, **changes: Any) -> gym.Env[Any, Any]:
+    """
+    :param run: whose environment
+    :param seed: of it
+    :param changes: arguments that it was not trained with
+    :return: the environment that the run was trained in
+    :raises ValueError: if rl_zoo3 has put wrappers around that: without them it would be another one
+    """
+    if wrapped := [name for name in WRAPPERS if run.settings.get(name)]:
+        raise ValueError(f"{run.folder} was trained with {wrapped[0]}={run.settings[wrapped[0]]!r}, which is not applied here")
     for package in run.arguments.get("gym_packages") or []:
         importlib.import_module(package)
     ours = run.arguments["env"].startswith(f"{NAMESPACE}/")
-    return gym.make(run.arguments["env"], **{**run.env_kwargs, **({"seed": seed} if ours else {})})  # LQR draws its springs
+    seeded = {"seed": seed} if ours else {}  # LQR draws its springs
+    return gym.make(run.arguments["env"], **{**run.env_kwargs, **seeded, **changes})
 
 
 def roll(model: SAC, env: gym.Env[Any, Any], *, decisions: int, episodes: int, seed: int) -> Rollout:

@@ -1,5 +1,6 @@
 """Returns where a policy was not trained."""
 
+import importlib.util
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from typer.testing import CliRunner
 
 from sb3_crc import make_dmc
+from sb3_crc.analysis import generalization_report
 from sb3_crc.analysis.generalization import RECORDS, GeneralizationCallback, ModeReturns, generalize, read_records
 from sb3_crc.analysis.generalization_report import Generalization, read_published, write_generalization
 from sb3_crc.analysis.policies import SavedPolicy
@@ -149,6 +151,28 @@ def test_curves_over_training(runs: dict[str, Path], policy: SavedPolicy, tmp_pa
     assert "over_training.png" in {path.name for path in write_generalization([one], tmp_path / "report")}
 
 
+def test_curves_are_drawn_where_all_trainings_of_a_method_were_evaluated(
+    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(generalization_report, "save", lambda figure, path: drawn.append(figure) or path)
+    watched = []
+    for number, (timesteps, returns) in enumerate([([10, 20, 30, 40], [1.0, 2.0, 3.0, 4.0]), ([20, 40], [6.0, 8.0])]):
+        folder = tmp_path / str(number) / runs["rad"].name
+        shutil.copytree(runs["rad"], folder)
+        np.savez(folder / RECORDS, timesteps=timesteps, video_easy=np.array(returns)[:, None])
+        watched.append(Run(folder))
+    generalization_report._draw_curves(watched, tmp_path / "over_training.png")
+    (line,) = drawn[0].axes[0].lines
+    assert line.get_xdata().tolist() == [20 * 40, 40 * 40] and line.get_ydata().tolist() == [4.0, 6.0]
+
+
+def test_a_report_speaks_of_nothing_that_is_not_in_it(runs: dict[str, Path], tmp_path: Path) -> None:
+    write_generalization([Generalization(named(runs["rad"]), 320, [ModeReturns("none", "none", (80.0,))])], tmp_path)
+    text = (tmp_path / "generalization.md").read_text()
+    assert "Shown" not in text and "ublished" not in text
+
+
 def test_published_scores() -> None:
     rows = read_published()
     at = {(row["method"], row["task"], row["mode"]): (row["mean"], row["std"]) for row in rows}
@@ -169,8 +193,22 @@ def test_command(runs: dict[str, Path], tmp_path: Path) -> None:
     assert "mode 'video_hrad'" in refused.output
 
 
+@pytest.mark.parametrize("name", ["generalize", "contact-sheet"])
+def test_a_missing_extra_is_named_before_anything_acts(
+    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda one, *rest: None if one == "matplotlib" else find(one, *rest))
+    models = [str(runs["rad"])] if name == "generalize" else []
+    done = CliRunner().invoke(app, [name, *models, "-o", str(tmp_path / "out")])
+    assert (
+        done.exit_code == 2
+        and done.stderr == "this needs matplotlib, of the extra 'analysis': pip install 'sb3-crc[analysis]'\n"
+    )
+
+
 def test_contact_sheet(tmp_path: Path) -> None:
-    sheet = tmp_path / "sheet.png"
+    sheet = tmp_path / "new" / "sheet.png"
     command = ["contact-sheet", "--tasks", "cartpole-swingup", "--render-quality", "fast", "-o", str(sheet)]
     result = CliRunner().invoke(app, [*command, "--modes", "color_hard,video_hard"])
     assert result.exit_code == 0, result.output

@@ -2,17 +2,19 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_crc import CRCSAC, make_dmc
 from sb3_crc.analysis.networks import encode, min_q_values, reconstruct, untrained_extractor
 from sb3_crc.analysis.policies import SavedPolicy, find_policies, unique_names
-from sb3_crc.analysis.rollouts import FOLDER, SEED, Rollout, rollout_of
+from sb3_crc.analysis.rollouts import FOLDER, SEED, Rollout, make_environment, rollout_of
 from sb3_crc.analysis.saliency import q_saliency
 from sb3_crc.experiments.runs import Run
 from tests.analysis.conftest import ENV_KWARGS, NOISE, make_model, make_run
@@ -114,6 +116,15 @@ def test_an_environment_without_physics_and_one_of_another_shape(tmp_path: Path)
     assert rollout.physics.shape == (30, 0) and rollout.physics_names.size == 0 and rollout.episodes.max() == 2
     again, _ = rolled(good, episodes=4)  # random frames, so equal only if the seed reaches the environment
     assert np.array_equal(again.observations[:10], rollout.observations[:10])
+
+
+@pytest.mark.parametrize(("name", "value"), [("env_wrapper", ["a.Wrapper"]), ("frame_stack", 4), ("vec_env_wrapper", "a.B")])
+def test_an_environment_that_rl_zoo3_has_wrapped_is_not_taken_for_another(tmp_path: Path, name: str, value: Any) -> None:
+    run = Run(make_run(tmp_path, "rad", train=0))
+    (config,) = run.folder.glob("*/config.yml")
+    config.write_text(yaml.dump({"env_kwargs": ENV_KWARGS, name: value}))
+    with pytest.raises(ValueError, match=f"was trained with {name}="):
+        make_environment(run, 0)
 
 
 def test_what_the_decoder_paints_is_a_picture(runs: dict[str, Path]) -> None:
