@@ -10,7 +10,7 @@ import typer
 
 from sb3_crc import completion
 from sb3_crc.analysis.commands import app as analysis
-from sb3_crc.command import Group, No, Program, command
+from sb3_crc.command import Group, No, Program, command, require
 from sb3_crc.console import errors, say, show, tell
 from sb3_crc.experiments.commands import app as experiments
 
@@ -129,8 +129,9 @@ def export(
 ) -> object:
     """Write a policy as safetensors and JSON, which can be read without trust; the zip that it comes from cannot."""
     from sb3_crc import CRCSAC
+    from sb3_crc.experiments.model_card import environment_arguments
     from sb3_crc.experiments.runs import Run
-    from sb3_crc.export import ENVIRONMENT_ARGUMENTS, export_policy
+    from sb3_crc.export import export_policy
     from sb3_crc.programs import ONNX, TORCH, export_program
 
     about: dict[str, Any] = {}
@@ -139,8 +140,7 @@ def export(
         source = run.model
         if not source.exists():
             raise FileNotFoundError(f"{run.folder} has no final policy: its training has not ended")
-        env_kwargs = {name: value for name, value in run.env_kwargs.items() if name in ENVIRONMENT_ARGUMENTS}
-        about = {"task": run.task, "env_kwargs": env_kwargs}
+        about = {"task": run.task, "env_kwargs": environment_arguments(run)}
     model = CRCSAC.load(source, device="cpu")
     program = output.suffix in (ONNX, TORCH)
     written = export_program(model, output) if program else export_policy(model, output, **about)
@@ -156,7 +156,10 @@ def export(
 )
 def enjoy(
     policy: Annotated[Path, typer.Argument(help="File of `sb3-crc export`, of anyone.")],
-    task: Annotated[str | None, typer.Option(help="domain-task; else the file's.", autocompletion=completion.tasks)] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(help="domain-task, seen as the file says; else the file's own.", autocompletion=completion.tasks),
+    ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Of the environment.")] = 0,
     film: Annotated[Path | None, typer.Option(help="mp4 file to write, of one more episode; else none.")] = None,
@@ -164,14 +167,18 @@ def enjoy(
     """Let an exported policy act by its mean action: print its returns, film it."""
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.utils import check_for_correct_spaces
 
     from sb3_crc.analysis.films import film as record
     from sb3_crc.envs.dmc import make_dmc
-    from sb3_crc.export import environment_of, load_policy
+    from sb3_crc.export import load_policy
 
+    if film is not None:
+        require("video", "av")
     acting = load_policy(policy)
-    found, env_kwargs = environment_of(policy) if task is None else (task, {})
+    found, env_kwargs = _stage(policy, task)
     env = make_vec_env(lambda: make_dmc(found, seed=seed, **env_kwargs), seed=seed)
+    check_for_correct_spaces(env, acting.observation_space, acting.action_space)  # dm_control would repeat a lone action
     returns, _ = evaluate_policy(acting, env, n_eval_episodes=episodes, return_episode_rewards=True)
     assert isinstance(returns, list)
     for episode, value in enumerate(returns):
@@ -182,3 +189,24 @@ def enjoy(
         say(f"{film}: {document['film_return']:.1f}")
     env.close()
     return document
+
+
+def _stage(policy: Path, task: str | None) -> tuple[str, dict[str, Any]]:
+    """
+    Where an exported policy acts: in another task, too, it sees and decides as in its own.
+
+    :return: task, and arguments of make_dmc
+    """
+    from sb3_crc.envs.tasks import default_action_repeat, task_names
+    from sb3_crc.export import PolicyFileError, environment_of
+
+    try:
+        own, env_kwargs = environment_of(policy)
+    except PolicyFileError:
+        if task is None:
+            raise
+        return task, {}
+    if task is None:
+        return own, env_kwargs
+    repeat = {"action_repeat": default_action_repeat(own)} if own in task_names() else {}
+    return task, {**repeat, **env_kwargs}
