@@ -3,7 +3,6 @@
 B batch, C channels (of the whole frame stack), H, W image height and width.
 """
 
-import logging
 import math
 import os
 from collections.abc import Mapping
@@ -16,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image
 from stable_baselines3.common.utils import FloatSchedule
-from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_crc.augmentations import center_crop
@@ -29,8 +27,6 @@ from sb3_crc.image_spaces import split_observations
 from sb3_crc.objectives import ObjectiveSettings, Reconstruction, objective_weights
 from sb3_crc.presets import PRESETS
 from sb3_crc.schedules import LearningRate, lr_schedule
-
-logger = logging.getLogger(__name__)
 
 
 class AuxiliaryLossCallback(BaseCallback):
@@ -71,7 +67,7 @@ class AuxiliaryLossCallback(BaseCallback):
     :param augmentation_kwargs: its arguments
     :param batch_size: transitions per update; None: the algorithm's
     :param encoder_tau: rate at which the key encoder follows, per update
-    :param verbose: 1: log when training starts
+    :param verbose: 1: say when training starts
     :raises ValueError: for arguments that cannot work; when ``learn()`` begins, for an algorithm that is on-policy or a
         CRCSAC, observations that are not images, an extractor without parameters, an augmentation that changes the size
     """
@@ -156,7 +152,7 @@ class AuxiliaryLossCallback(BaseCallback):
         if not self.learner.ready():
             return
         if self.verbose > 0 and self.learner.n_updates == 0:
-            logger.info("AuxiliaryLossCallback trains %s from now on", type(self.learner.extractor).__name__)
+            print(f"AuxiliaryLossCallback trains {type(self.learner.extractor).__name__} from now on")
         for name, value in self.learner.train().items():
             self.logger.record(name, value)
         self.logger.record("representation/n_updates", self.learner.n_updates, exclude="tensorboard")
@@ -228,21 +224,13 @@ class ReconstructionImageCallback(BaseCallback):
         images = center_crop(images, encoder.input_shape[1:])
         pixels = scale_pixels(images)
         with th.no_grad(), th.random.fork_rng():  # quantisation draws noise
-            decoded = decoder(encoder(pixels))  # (B, C, H, W), or about half of H and W
-            if self._reconstruction.standardize:
-                mean, scale = self._reconstruction.center_and_scale(self._reconstruction.painted(images))
-                decoded = decoded * scale + mean
+            decoded = self._reconstruction.as_pixels(decoder(encoder(pixels)), images)  # (B, C, H, W)
         encoder.train(modes[0])
         decoder.train(modes[1])
-        if self._reconstruction.bits is not None:
-            decoded = decoded + 0.5  # a quantised target is centred at zero
         shown = self.frame_channels or (3 if pixels.shape[1] % 3 == 0 else 1)
-        decoded = F.interpolate(decoded, pixels.shape[2:])
-        rows = [
-            th.cat(list(images[: self.n_images, -shown:]), dim=2) for images in (pixels, decoded)
-        ]  # (shown, H, n_images W)
+        rows = [th.cat(list(one[: self.n_images, -shown:]), dim=2) for one in (pixels, decoded)]  # (shown, H, n_images W)
         picture = th.cat(rows, dim=1).expand(3, -1, -1)
-        return (picture.clamp(0, 1) * 255).round().to(th.uint8).cpu()
+        return (picture * 255).round().to(th.uint8).cpu()
 
 
 class ObjectiveScheduleCallback(BaseCallback):

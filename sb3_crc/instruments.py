@@ -64,7 +64,7 @@ def watched(
 
 
 class CollapseAlarm:
-    """Warns once when the latent has been almost the same for every image for a thousand updates."""
+    """Warns, once for each time, when the latent has been almost the same for every image for a thousand updates."""
 
     def __init__(self) -> None:
         self._updates = 0

@@ -416,15 +416,14 @@ def test_no_argument_of_a_checkpoint_is_left_out() -> None:
 # -- What a training's end does not show -------------------------------------------------------------------------------
 
 
-def test_verbose_tells_more(tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:
+def test_verbose_tells_more(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     new_model(verbose=0)
     assert capsys.readouterr().out == ""
     new_model(verbose=1)
     assert "Using cpu device" in capsys.readouterr().out
-    caplog.set_level("INFO")
     for verbose in (0, 1):
         with_auxiliary_loss(verbose=verbose)
-        assert ("AuxiliaryLossCallback trains PixelEncoder" in caplog.text) == (verbose == 1)
+        assert ("AuxiliaryLossCallback trains PixelEncoder" in capsys.readouterr().out) == (verbose == 1)
     new_model().learn(8, callback=TrainingCheckpoint(tmp_path))
     for verbose in (0, 1):
         new_model().learn(12 + 4 * verbose, callback=TrainingCheckpoint(tmp_path, verbose=verbose))

@@ -9,7 +9,6 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch.nn import functional as F
 
 from sb3_crc.augmentations import center_crop
 from sb3_crc.crc_sac import CRCSAC
@@ -85,10 +84,5 @@ def reconstruct(model: SAC, images: np.ndarray) -> np.ndarray | None:
     seen = center_crop(th.from_numpy(images), encoder.input_shape[1:])
     with th.no_grad(), th.random.fork_rng(devices=[]):  # quantisation draws noise
         decoded: th.Tensor = th.cat([objective.decoder(encoder(scale_pixels(part))) for part in th.split(seen, BATCH)])
-        if objective.standardize:
-            mean, scale = objective.center_and_scale(objective.painted(seen))
-            decoded = decoded * scale + mean
-    if objective.bits is not None:
-        decoded = decoded + 0.5  # a quantised target is centred at zero
-    painted: np.ndarray = F.interpolate(decoded, encoder.input_shape[1:]).clamp(0, 1).numpy()
+        painted: np.ndarray = objective.as_pixels(decoded, seen).numpy()
     return painted

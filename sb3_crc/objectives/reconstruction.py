@@ -169,6 +169,21 @@ class Reconstruction(AuxiliaryObjective):
         mean = painted.mean(dim=0)
         return mean, (painted - mean).square().mean(dim=(0, 2, 3), keepdim=True).sqrt().clamp(min=1e-4)
 
+    def as_pixels(self, decoded: th.Tensor, images: th.Tensor) -> th.Tensor:
+        """
+        What was painted as somebody can look at it: at its place among the pixels, and of their size.
+
+        :param decoded: what the decoder paints of the latents of ``images``
+        :param images: uint8 ``(B, C, H, W)``; where the reconstruction is standardised, their mean image is put back
+        :return: ``(B, C, H, W)`` in [0, 1]; with frame differences only the newest frame is a picture
+        """
+        if self.standardize:
+            mean, scale = self.center_and_scale(self.painted(images))
+            decoded = decoded * scale + mean
+        if self.bits is not None:
+            decoded = decoded + 0.5  # a quantised target is centred at zero
+        return F.interpolate(decoded, images.shape[2:]).clamp(0, 1)
+
     def _target(self, view: View) -> th.Tensor:
         as_it_is = self.bits is None and self.step == 1
         painted = self.painted(view.images, view.pixels if as_it_is else None)
