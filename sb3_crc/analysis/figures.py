@@ -140,7 +140,7 @@ def probe_figure(rows: Sequence[Row], quantities: Sequence[str], title: str) -> 
         }
         means = np.array([np.mean([row["value"] for row in own[name]]) for name in quantities])
         x = np.arange(len(quantities)) + (number - (len(methods) - 1) / 2) * width
-        colour = f"C{number}" if own[quantities[0]][0]["file"] is not None else ("0.55", "0.8")[number % 2]
+        colour = f"C{number}" if own[quantities[0]][0]["file"] is not None else ("0.55", "0.8")[(len(methods) - number) % 2]
         axes.bar(x, means.clip(LOWEST_R2), width * 0.92, color=colour, label=method)
         for at, name in zip(x, quantities, strict=True):
             models = own[name]

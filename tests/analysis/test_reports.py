@@ -116,6 +116,15 @@ def test_bars_are_means_over_models_and_the_heat_map_has_four_blocks(tmp_path: P
     assert is_drawn(save(correlation_figure(blocks, ("A", "B"), "vectors"), tmp_path / "map.png"))
 
 
+def test_what_is_beside_the_models_has_the_same_greys_however_many_there_are() -> None:
+    common = {"number": "R^2 of all", "value": 0.5, "low": 0.4, "high": 0.6}
+    beside = [{**common, "method": method, "file": None} for method in ("untrained encoder", "PCA of pixels")]
+    for methods in (["crc"], ["crc", "rad"], ["crc", "curl", "rad"]):
+        rows = [{**common, "method": method, "file": f"{method}.zip"} for method in methods] + beside
+        bars = probe_figure(rows, ["all"], "a title").axes[0].patches
+        assert [bar.get_facecolor()[0] for bar in bars[-2:]] == [0.55, 0.8]
+
+
 def test_numbers_that_do_not_exist_are_null_in_json(tmp_path: Path) -> None:
     write_rows([{"value": float("nan"), "low": None, "name": "x"}], tmp_path, "numbers")
     assert json.loads((tmp_path / "numbers.json").read_text()) == [{"value": None, "low": None, "name": "x"}]
