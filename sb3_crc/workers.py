@@ -4,6 +4,7 @@ import atexit
 import math
 import multiprocessing
 import signal
+import time
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,17 +14,20 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import SubprocVecEnv
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnv, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs, _worker
 
 #: Seconds in which an environment must answer
 TIMEOUT = 300.0
 
-#: Seconds that a new process has at least, since it must first import what it needs
+#: Seconds that a new process has at least for its first answer, since it must import what it needs and make its environment
 START = 120.0
 
 #: Seconds after which somebody who waits looks again
 PAUSE = 0.5
+
+#: Seconds in which environments that are closed may end of themselves
+FAREWELL = 5.0
 
 #: Reach each process of a terminal or of a job. They are for the training, which answers them with the environments' states
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -51,9 +55,12 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
 
     :param env_fns: make the environments
     :param start_method: as in SB3
-    :param timeout: seconds in which each must answer; those in which this process itself is stopped do not count
+    :param timeout: seconds in which each must answer, or :data:`START` if that is more while it is made; those in which this
+        process itself is stopped do not count
     :param restart: replace one that has died or hangs in a step by a new one: its episode ends there, truncated, and the next
         one begins by another seed. Otherwise, and outside of steps, a :class:`WorkerError` names it
+    :raises ValueError: if ``timeout`` is not a positive number of seconds
+    :raises WorkerError: for the first environment that cannot be made, or not in time; the processes of all are ended
     """
 
     def __init__(
@@ -64,22 +71,33 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         timeout: float = TIMEOUT,
         restart: bool = False,
     ):
+        if not 0 < timeout < math.inf:
+            raise ValueError(f"timeout={timeout} must be a positive number of seconds")
         self.timeout = timeout
         self.restart = restart
         #: How often one was replaced
         self.restarts = 0
+        self.waiting = self.closed = False
         self._env_fns: list[Make] = [partial(_undisturbed, make) for make in env_fns]
         self._last: list[Any] = [None] * len(env_fns)
-        super().__init__(self._env_fns, start_method)
         methods = multiprocessing.get_all_start_methods()
         self._start_method = start_method or ("forkserver" if "forkserver" in methods else "spawn")
-        self.remotes = tuple(
-            _WatchedPipe(remote, process, index, timeout)
-            for index, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True))
-        )
+        self.remotes: tuple[_WatchedPipe, ...] = ()
+        self.processes: list[Any] = []
         # Before multiprocessing waits for processes that nobody has told to end
         self._at_exit = partial(_close, weakref.ref(self))
         atexit.register(self._at_exit)
+        try:
+            for index in range(len(env_fns)):
+                remote, process = self._started(index)
+                self.remotes += (remote,)
+                self.processes.append(process)
+            self.remotes[0].send(("get_spaces", None))
+            # Not SubprocVecEnv's constructor, which waits for ever for an environment whose own does not end
+            VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
+        except BaseException:
+            self.close()
+            raise
 
     def step_async(self, actions: np.ndarray) -> None:
         """:param actions: ``(N, A)``"""
@@ -119,10 +137,12 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         """End all processes, also those that do not listen any more."""
         if self.closed:
             return
-        for remote, process in zip(self.remotes, self.processes, strict=True):
-            if not self.waiting:
+        if not self.waiting:
+            for remote in self.remotes:
                 remote.send_if_alive(("close", None))
-            process.join(5.0 if not self.waiting else 0.0)
+        until = time.monotonic() + (0.0 if self.waiting else FAREWELL)
+        for remote, process in zip(self.remotes, self.processes, strict=True):
+            process.join(max(0.0, until - time.monotonic()))
             if process.is_alive():
                 process.kill()
                 process.join()
@@ -130,23 +150,26 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.closed = True
         atexit.unregister(self._at_exit)
 
-    def _replaced(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
-        """:return: the end of the lost episode, as a worker tells of one"""
-        self.restarts += 1
-        self.processes[index].kill()
-        self.processes[index].join()
-        self.remotes[index].close()
+    def _started(self, index: int) -> "tuple[_WatchedPipe, Any]":
+        """:return: the pipe to a new process that makes this environment, and the process"""
         context: Any = multiprocessing.get_context(self._start_method)
         remote, work_remote = context.Pipe()
         arguments = (work_remote, remote, CloudpickleWrapper(self._env_fns[index]))
         process = context.Process(target=_worker, args=arguments, daemon=True)
         process.start()
         work_remote.close()
-        watched = _WatchedPipe(remote, process, index, self.timeout)
-        self.processes[index] = process
-        self.remotes = (*self.remotes[:index], watched, *self.remotes[index + 1 :])
-        watched.send(("reset", (1_000_003 * self.restarts + index, None)))
-        observation, reset_info = watched.recv(max(self.timeout, START))
+        return _WatchedPipe(remote, process, index, self.timeout), process
+
+    def _replaced(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
+        """:return: the end of the lost episode, as a worker tells of one"""
+        self.restarts += 1
+        self.processes[index].kill()
+        self.processes[index].join()
+        self.remotes[index].close()
+        remote, self.processes[index] = self._started(index)
+        self.remotes = (*self.remotes[:index], remote, *self.remotes[index + 1 :])
+        remote.send(("reset", (1_000_003 * self.restarts + index, None)))
+        observation, reset_info = remote.recv()
         info = {"TimeLimit.truncated": True, "terminal_observation": self._last[index], "restarted": True}
         return observation, 0.0, True, info, reset_info
 
@@ -173,6 +196,8 @@ class _WatchedPipe:
         self._index = index
         self._timeout = timeout
         self._asked: Any = None
+        #: Whether it has answered: before that it makes its environment, whatever it was asked
+        self._is_made = False
 
     def send(self, message: Any) -> None:
         self._asked = message[0]
@@ -186,18 +211,20 @@ class _WatchedPipe:
         with suppress(OSError):  # told of when its answer is awaited
             self._pipe.send(message)
 
-    def recv(self, timeout: float | None = None) -> Any:
-        timeout = timeout or self._timeout
+    def recv(self) -> Any:
+        timeout = self._timeout if self._is_made else max(self._timeout, START)
         try:
             for _ in range(math.ceil(timeout / PAUSE)):
                 if self._pipe.poll(PAUSE):
-                    return self._pipe.recv()
+                    answer = self._pipe.recv()
+                    self._is_made = True
+                    return answer
         except (EOFError, ConnectionError):
             raise self._dead() from None
+        what = f"has not answered {self._asked!r}" if self._is_made else "has not been made"
         raise WorkerError(
             self._index,
-            f"environment {self._index} (process {self._process.pid}) has not answered {self._asked!r} within "
-            f"{timeout:g} s: it hangs",
+            f"environment {self._index} (process {self._process.pid}) {what} within {timeout:g} s: it hangs",
         )
 
     def close(self) -> None:
@@ -207,8 +234,9 @@ class _WatchedPipe:
         self._process.join(1.0)
         code = self._process.exitcode
         how = f"was killed by signal {-code}" if code is not None and code < 0 else f"has ended with exit code {code}"
+        when = f"asked to {self._asked!r}" if self._is_made else "before it was made"
         return WorkerError(
             self._index,
-            f"environment {self._index} (process {self._process.pid}) {how}, asked to {self._asked!r}: what it said last "
-            "stands above, in the error output",
+            f"environment {self._index} (process {self._process.pid}) {how}, {when}: what it said last stands above, in the "
+            "error output",
         )

@@ -1,5 +1,6 @@
 """Environments in processes that die, hang or raise."""
 
+import multiprocessing
 import os
 import signal
 import time
@@ -12,11 +13,11 @@ import pytest
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
 
-from sb3_crc import CRCSAC
+from sb3_crc import CRCSAC, workers
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
-from tests.checkpoints.test_callback import SETTINGS, STEPS, assert_equal, cartpole
+from tests.checkpoints.runs import SETTINGS, STEPS, assert_equal, cartpole
 from tests.conftest import POLICY_KWARGS, NoiseEnv
 
 
@@ -67,6 +68,42 @@ def test_an_environment_that_fails_is_named(how: str, message: str) -> None:
     began = time.monotonic()
     env.close()
     assert time.monotonic() - began < 10 and not any(process.is_alive() for process in env.processes)
+
+
+def make_failing(how: str) -> Failing:
+    if how == "hangs":
+        time.sleep(600)
+    if how == "raises":
+        raise ZeroDivisionError("in the constructor")
+    return Failing("works")
+
+
+@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("hangs", r"environment {} \(process \d+\) has not been made within 5 s: it hangs"),
+        ("raises", r"environment {} \(process \d+\) has ended with exit code 1, before it was made"),
+    ],
+)
+def test_an_environment_that_cannot_be_made_is_named(
+    how: str, message: str, index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And no process is left, which would keep this one from ending."""
+    monkeypatch.setattr(workers, "START", 5.0)
+    monkeypatch.setattr(workers, "FAREWELL", 1.0)
+    makers: list[Any] = [partial(make_failing, "works")] * 2
+    makers[index] = partial(make_failing, how)
+    with pytest.raises(WorkerError, match=message.format(index)) as error:
+        WatchedSubprocVecEnv(makers, "fork", timeout=3.0)  # nothing is imported anew
+    assert error.value.index == index
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf"), float("nan")])
+def test_the_timeout_is_a_number_of_seconds(timeout: float) -> None:
+    with pytest.raises(ValueError, match=f"timeout={timeout} must be a positive number of seconds"):
+        environments("works", timeout=timeout)
 
 
 def test_without_a_failure_it_is_sb3s() -> None:
