@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
@@ -150,7 +149,7 @@ def q_value_and_soft_return(
 ) -> tuple[float, float]:
     """
     :param model: whose critic and actor are asked
-    :param episode: observation, action as the environment took it, and reward of each of the T steps
+    :param episode: observation, channels first or last, action as the environment took it, and reward of each of the T steps
     :param last: the observation after the last step, if a time limit ended the episode; None: it terminated
     :return: min Q(s_0, a_0), and the discounted soft return of the episode
     """
@@ -158,18 +157,18 @@ def q_value_and_soft_return(
     frames = _stack([*observations, *([] if last is None else [last])])
     n_frames = len(rewards) + (last is not None)
     policy, device = model.policy, model.device
-    state = th.get_rng_state()  # evaluating must not change the run's random numbers
-    with th.no_grad():
+    gpus = [device] if device.type == "cuda" else []
+    with th.no_grad(), th.random.fork_rng(gpus):  # evaluating must not change the run's random numbers
         taken = th.as_tensor(policy.scale_action(np.stack(actions[:1])), dtype=th.float32, device=device)
-        q_value = th.cat(policy.critic(obs_as_tensor(_rows(frames, slice(1)), device), taken)).min()
+        first, _ = policy.obs_to_tensor(_rows(frames, slice(1)))
+        q_value = th.cat(policy.critic(first, taken)).min()
         entropies, value = [], th.zeros(())
         for chunk in np.array_split(np.arange(n_frames), max(1, n_frames // 128)):
-            seen = obs_as_tensor(_rows(frames, chunk), device)
+            seen, _ = policy.obs_to_tensor(_rows(frames, chunk))
             drawn, log_prob = policy.actor.action_log_prob(seen)
             entropies.append(-model._temperature() * log_prob)
             if last is not None:  # of the last chunk its last frame counts
                 value = th.cat(policy.critic(_rows(seen, slice(-1, None)), drawn[-1:])).min() + entropies[-1][-1]
-    th.set_rng_state(state)
     soft_rewards = model.reward_scale * np.array(rewards)
     soft_rewards[1:] += th.cat(entropies).cpu().numpy()[1 : len(rewards)]
     discounts = model.gamma ** np.arange(len(rewards))

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -69,12 +70,43 @@ def test_the_bias_is_logged_at_each_evaluation() -> None:
     assert record.written["eval/q_bias"] == pytest.approx(4.0 - soft_return, rel=1e-4)
 
 
-def test_evaluating_draws_no_random_numbers_of_the_run() -> None:
-    model = make_model()
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="no GPU"))]
+)
+def test_evaluating_draws_no_random_numbers_of_the_run(device: str) -> None:
+    model = make_model(device=device)
     frame = NoiseEnv().reset(seed=0)[0]
-    state = th.get_rng_state()
-    q_value_and_soft_return(model, [(frame, np.zeros(2, np.float32), 1.0)] * 3, frame)
-    assert th.equal(state, th.get_rng_state())
+    episode = [(frame, np.zeros(2, np.float32), 1.0)] * 3
+    states = []
+    for _ in range(2):
+        states.append([th.get_rng_state(), *([th.cuda.get_rng_state()] if device == "cuda" else [])])
+        q_value_and_soft_return(model, episode, frame)
+    assert all(map(th.equal, *states))
+
+
+class ChannelLastEnv(NoiseEnv):
+    """As :class:`NoiseEnv`, frames with channels last."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        channels, *size = self.observation_space.shape
+        self.first = self.observation_space
+        self.observation_space = gym.spaces.Box(0, 255, (*size, channels), np.uint8)
+
+    def _frame(self) -> np.ndarray:
+        return self.np_random.integers(0, 256, self.first.shape, dtype=np.uint8).transpose(1, 2, 0)
+
+
+@pytest.mark.filterwarnings("ignore:Training and eval env are not of the same type")
+def test_channels_may_come_last() -> None:
+    """SB3 turns them round for the training, not for evaluations: there only ``predict`` does."""
+    logged = []
+    for env in (NoiseEnv, ChannelLastEnv):
+        model = make_model(env())
+        callback = QBiasEvalCallback(env(), eval_freq=6, n_eval_episodes=1, verbose=0, warn=False)
+        model.learn(6, callback=callback, reset_num_timesteps=False)
+        logged.append([model.logger.name_to_value[f"eval/{name}"] for name in ("q_value", "soft_return")])
+    assert logged[0] == pytest.approx(logged[1])
 
 
 def test_other_algorithms_are_evaluated_as_ever() -> None:
