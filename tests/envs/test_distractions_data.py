@@ -258,6 +258,16 @@ def archive(**arrays: np.ndarray) -> bytes:
 NOISE = archive(frames=np.random.default_rng(0).integers(0, 256, (5, 20, 20, 3), dtype=np.uint8))
 
 
+def damaged(content: bytes, offset: int, value: int) -> bytes:
+    """:return: an archive of one file, with another byte at an offset of its local header, and at that of the central one"""
+    changed = bytearray(content)
+    changed[offset] = changed[content.rfind(b"PK\1\2") + offset + 2] = value
+    return bytes(changed)
+
+
+METHOD, ENCRYPTED = damaged(NOISE, 8, 99), damaged(NOISE, 6, 1)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -265,6 +275,8 @@ NOISE = archive(frames=np.random.default_rng(0).integers(0, 256, (5, 20, 20, 3),
         ("broken.npz", b"no archive", r"broken\.npz is no clip"),
         ("half.npz", NOISE[: len(NOISE) // 2], r"half\.npz is no clip"),
         ("bits.npz", NOISE[:300] + bytes(40) + NOISE[340:], r"bits\.npz is no clip"),
+        ("method.npz", METHOD, r"method\.npz is no clip"),
+        ("encrypted.npz", ENCRYPTED, r"encrypted\.npz is no clip"),
         ("two.npz", archive(a=np.zeros((5, 8, 8, 3), np.uint8), b=np.zeros(2)), r"two\.npz is no clip.*2 arrays: a, b"),
         ("none.npy", b"", r"none\.npy is no clip"),
         ("short.npy", np.zeros((1, 8, 8, 3), np.uint8), r"short\.npy is too short: 1 frames"),
@@ -351,6 +363,9 @@ def test_an_mp4_needs_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         ("table.json", b"[]", r"table\.json: grid_rgb1 has shape \(0,\)"),
         ("half.npz", NOISE[: len(NOISE) // 2], r"half\.npz is no table of colours"),
         ("bits.npz", NOISE[:300] + bytes(40) + NOISE[340:], r"bits\.npz is no table of colours"),
+        ("none.npz", b"", r"none\.npz is no table of colours"),
+        ("method.npz", METHOD, r"method\.npz is no table of colours"),
+        ("encrypted.npz", ENCRYPTED, r"encrypted\.npz is no table of colours"),
         ("other.npz", NOISE, r"other\.npz is no table of colours.*grid_rgb1"),
         ("nan.npz", archive(**{name: np.full((2, 3), np.nan) for name in DEFAULT}), r"outside \[0, 1\]"),
     ],

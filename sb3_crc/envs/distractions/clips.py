@@ -24,6 +24,8 @@ SUFFIXES = (".mp4", ".npz", ".npy")
 SHORTEST, LONGEST = 2, 10_000
 #: Pixels of one frame, and bytes of a whole npz, at most: more is refused before it is decoded
 MOST_PIXELS, MOST_BYTES = 1 << 24, 1 << 32
+#: What NumPy raises for a damaged npy or npz: the last is zipfile's, of a compression or encryption that it does not know
+UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError)
 #: Of the files that resized clips are kept in
 FORMAT = 1
 PROCEDURAL_FRAMES = 600
@@ -191,7 +193,7 @@ def _decoded(path: Path) -> Iterator[np.ndarray]:
                 if len(content.files) != 1:
                     raise ValueError(f"it holds {len(content.files)} arrays: {', '.join(content.files)}")
                 content = content[content.files[0]]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path} is no clip, one array of frames: {error}") from error
     if content.ndim != 4 or content.shape[3] != 3 or content.dtype != np.uint8 or 0 in content.shape[1:]:
         raise ValueError(f"{path} holds {content.dtype} {content.shape}; a clip is uint8 (frames, height, width, 3)")

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_crc.envs.distractions.clips import UNREADABLE
 from sb3_crc.envs.distractions.textures import BODY, GRID, SKYBOX, Scene
 
 #: dm_control's own colours, RGB in [0, 1]
@@ -117,7 +116,7 @@ def read_table(path: Path, mode: str) -> tuple[Table, str]:
         if isinstance(content, list):  # one mapping per entry
             content = {name: [entry[name] for entry in content] for name in DEFAULT}
         table = {name: np.array(content[name], np.float64) for name in DEFAULT}
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+    except (*UNREADABLE, KeyError, TypeError) as error:
         raise ValueError(f"{found} is no table of colours with {', '.join(DEFAULT)}: {error!r}") from error
     for name, values in table.items():
         if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(table["self_rgb"]) or not len(values):
