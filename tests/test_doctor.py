@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,6 +44,17 @@ def test_a_buffer_that_does_not_fit_is_noted(monkeypatch: pytest.MonkeyPatch) ->
     findings = {finding.name: finding for finding in examine_memory()}
     assert findings["paper's buffer"].verdict == "note" and "does not fit" in findings["paper's buffer"].value
     assert findings["laptop buffer"].verdict == "ok"
+
+
+def test_what_is_timed_is_the_picture_of_an_observation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which draws with one camera, where dm_control's own ``render`` builds and frees one each time."""
+    from dm_control.mujoco.engine import Camera
+
+    built: list[Any] = []
+    build = Camera.__init__
+    monkeypatch.setattr(Camera, "__init__", lambda self, *args, **kwargs: built.append(self) or build(self, *args, **kwargs))
+    assert doctor.milliseconds_per_frame("fast", 36, frames=5) > 0
+    assert len(built) == 1
 
 
 def write(path: Path, text: str) -> None:
