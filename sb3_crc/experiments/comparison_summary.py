@@ -1,7 +1,7 @@
 """What a comparison says in words and numbers: ``summary.md`` and ``summary.csv`` of ``sb3-crc curves``."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,10 +62,7 @@ def summary(
         rows = [(method, *(found[name].text() for name in STATISTICS)) for method, found in aggregates.items()]
         lines += [*markdown(("method", *STATISTICS), rows), ""]
     if compared:
-        lines += [f"## Against {baseline}", ""]
-        header = ("method", "difference of IQMs", "verdict", f"P(method > {baseline})")
-        cells = [(one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")) for one in compared]
-        lines += markdown(header, cells)
+        lines += [f"## Against {baseline}", "", *difference_table(compared)]
         lines += ["", f"'{NOT_RESOLVED}': the interval of the difference includes 0, or there is none.", ""]
     if len(matrices.seeds) > 1:
         lines += ["In parentheses: 95 % intervals, stratified bootstrap over seeds; differences paired by seed.", ""]
@@ -87,9 +84,16 @@ def listed(title: str, entries: Sequence[str]) -> list[str]:
     return [f"## {title}", "", *(f"- {entry}" for entry in entries), ""] if entries else []
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """:return: lines of a table"""
-    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+def difference_table(compared: Sequence[Difference]) -> list[str]:
+    """:param compared: methods with one baseline, at least one; :return: lines of a table"""
+    header = ("method", "difference of IQMs", "verdict", f"P(method > {compared[0].baseline})")
+    return markdown(header, [(one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")) for one in compared])
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], marks: Sequence[str] | None = None) -> list[str]:
+    """:param marks: how each column is aligned; None: as ever; :return: lines of a table, whatever is in its cells"""
+    lines = (header, marks or ["---"] * len(header), *rows)
+    return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in lines]
 
 
 def write_rows(

@@ -1,10 +1,13 @@
 """Learning curves."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sb3_crc.experiments.runs import read_evaluations
 
 
 def plot_learning_curve(
@@ -23,11 +26,13 @@ def plot_learning_curve(
     :param action_repeat: environment steps per agent step, for the lower axis
     :param title: above the picture
     :param references: name -> return of policies to compare with, drawn as horizontal lines
+    :raises FileNotFoundError: if there are no evaluations
+    :raises ValueError: if they cannot be read, naming the file
     """
     from matplotlib.figure import Figure  # without pyplot no display is asked for
 
-    with np.load(evaluations) as data:
-        steps, returns = data["timesteps"], data["results"]  # (evaluations,), (evaluations, episodes)
+    found = read_evaluations(evaluations)
+    steps, returns = found["timesteps"], found["results"]  # (evaluations,), (evaluations, episodes)
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     environment_steps = steps * action_repeat
@@ -50,6 +55,7 @@ def plot_learning_curves(
 
     :param runs: method -> the ``evaluations.npz`` of each of its seeds
     :param picture: as for :func:`plot_learning_curve`, like what follows
+    :raises FileNotFoundError: as there, like ValueError
     """
     from matplotlib.figure import Figure
 
@@ -58,11 +64,9 @@ def plot_learning_curves(
     for number, (method, files) in enumerate(runs.items()):
         seeds: list[dict[int, float]] = []
         for file in files:
-            with np.load(file) as data:
-                means = data["results"].mean(axis=1)
-                seeds.append(
-                    {int(step) * action_repeat: float(mean) for step, mean in zip(data["timesteps"], means, strict=True)}
-                )
+            found = read_evaluations(file)
+            points = zip(found["timesteps"], found["results"].mean(axis=1), strict=True)
+            seeds.append({int(step) * action_repeat: float(mean) for step, mean in points})
             axes.plot(list(seeds[-1]), list(seeds[-1].values()), color=f"C{number}", linewidth=0.8, alpha=0.5)
         shared = sorted(set.intersection(*(set(seed) for seed in seeds)))
         mean = [float(np.mean([seed[step] for seed in seeds])) for step in shared]
@@ -73,7 +77,7 @@ def plot_learning_curves(
 
 
 def _finish(axes: Any, action_repeat: int, title: str, references: Mapping[str, float] | None, lowest: float = 0.0) -> None:
-    for style, (name, value) in zip(("--", ":", "-."), (references or {}).items(), strict=False):
+    for style, (name, value) in zip(cycle(("--", ":", "-.")), (references or {}).items(), strict=False):
         axes.axhline(value, linestyle=style, color="black", linewidth=1, label=f"{name} ({value:.0f})")
     axes.set_xlabel(f"environment steps ({action_repeat} per agent step)")
     axes.set_ylabel("return of an evaluation episode")

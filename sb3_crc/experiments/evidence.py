@@ -3,16 +3,15 @@
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_crc.experiments.comparison_summary import markdown
+from sb3_crc.experiments.comparison_summary import difference_table, markdown
 from sb3_crc.experiments.published import SIX_TASKS, read_published
 from sb3_crc.experiments.runs import read_json
 from sb3_crc.experiments.scores import final_means, one_protocol, read_scores
 from sb3_crc.experiments.statistics import HIGHEST_RETURN, NOT_RESOLVED, aggregate, differences, score_matrices
-from sb3_crc.experiments.tables import check_whole
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
@@ -43,13 +42,12 @@ def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | No
     :param trials: table of the trials that led to the settings
     :return: Markdown. The same files give the same page
     :raises FileNotFoundError: if a file does not exist
-    :raises ValueError: if there are no final scores, or they do not belong together
+    :raises ValueError: if there are no final scores, episodes are missing, or they do not belong together
     """
     scores = read_scores(sources)
     final = scores.final
     if final.empty:
         raise ValueError(f"there is no score of a final policy in {', '.join(map(str, sources))}")
-    check_whole(final)
     means = final_means(one_protocol(final))
     check_name("baseline", baseline, list(dict.fromkeys(means["method"])))
     lines = ["# Results", ""]
@@ -121,13 +119,9 @@ def _compared(means: "pd.DataFrame", baseline: str) -> Iterator[str]:
     matrices = score_matrices(means)
     if len(matrices.scores) < 2:
         return
-    rows = [
-        [one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")]
-        for one in differences(matrices.scores, baseline)
-    ]
     about = f"{', '.join(matrices.tasks)}; seeds {', '.join(map(str, matrices.seeds))}, those that every method has."
     yield from [f"## Against {baseline}", "", about, ""]
-    yield from markdown(["method", "difference of IQMs", "verdict", f"P(method > {baseline})"], rows)
+    yield from difference_table(differences(matrices.scores, baseline))
     yield from ["", f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0.", ""]
 
 
@@ -159,35 +153,3 @@ def _trials(path: Path) -> Iterator[str]:
 
 def _paragraph(text: str) -> list[str]:
     return [*textwrap.wrap(text, 127, break_long_words=False, break_on_hyphens=False), ""]
-
-
-def compare_with(committed: Path, reproduced: Path) -> dict[str, Any]:
-    """
-    :param committed: CSV file of scores, or folder of runs
-    :param reproduced: the same, of one method on one task
-    :return: ``method``, ``task``, ``committed`` and ``reproduced`` returns by seed, and the 95 % ``interval`` in which the
-        mean of the reproduced seeds is to be expected if nothing has changed (Student's t); None with one committed seed
-    :raises ValueError: if one has no final score, or the other none of the same
-    """
-    from scipy.stats import t
-
-    found = final_means(read_scores([reproduced]).final)
-    if len(found[["method", "task"]].drop_duplicates()) != 1:
-        raise ValueError(f"{reproduced} must hold final scores of one method on one task")
-    method, task = found[["method", "task"]].iloc[0]
-    before = final_means(read_scores([committed]).final)
-    before = before[(before["method"] == method) & (before["task"] == task)]
-    if before.empty:
-        raise ValueError(f"{committed} has no final score of {method} on {task}")
-    old, new = before["return"].to_numpy(float), found["return"].to_numpy(float)
-    interval = None
-    if len(old) > 1:
-        half = t.ppf(0.975, len(old) - 1) * old.std(ddof=1) * np.sqrt(1 / len(old) + 1 / len(new))
-        interval = float(old.mean() - half), float(old.mean() + half)
-    return {
-        "method": str(method),
-        "task": str(task),
-        "committed": {int(seed): float(value) for seed, value in zip(before["seed"], old, strict=True)},
-        "reproduced": {int(seed): float(value) for seed, value in zip(found["seed"], new, strict=True)},
-        "interval": interval,
-    }

@@ -1,18 +1,19 @@
 """The score of a run: its final policy, after exactly its budget, on fresh episodes."""
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.provenance import provenance
 from sb3_crc.experiments.runs import FINAL, Run, write_json
 from sb3_crc.presets import PRESETS
+from sb3_crc.settings import check_name
+from sb3_crc.stock import STOCK
 
 #: Seed of the final evaluation of every run: no training has it, and no evaluation during training (sb3_crc.evaluation)
 FIRST_SEED = 10_000
@@ -24,7 +25,9 @@ def load_final(run: Run) -> SAC:
     :param run: one that has ended
     :return: its final policy, on the CPU
     :raises FileNotFoundError: if training has not ended
+    :raises ValueError: if its algorithm is none of ours
     """
+    check_name(f"algorithm of {run.folder}:", run.preset, [*PRESETS, *STOCK])
     if not run.model.exists():
         raise FileNotFoundError(f"{run.folder} has no final policy: its training has not ended ({run.model.name} is missing)")
     algorithm = CRCSAC if run.preset in PRESETS else SAC
@@ -66,7 +69,7 @@ def evaluate_final(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED
         "environment_steps": steps,
         "agent_steps": model.num_timesteps,
         "updates": model._n_updates,
-        "seconds": _training_seconds(run.folder / "evaluations.npz"),
+        "seconds": _training_seconds(run),
         "first_seed": seed,
         "returns": _returns(model, run, episodes, seed),
         "evaluated": provenance(),
@@ -76,7 +79,10 @@ def evaluate_final(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED
 
 
 def _returns(model: SAC, run: Run, episodes: int, seed: int) -> list[float]:
-    env = Monitor(gym.make(run.arguments["env"], **{**run.env_kwargs, "seed": seed}))
+    own = {"seed": seed} if run.is_of_suite else {}  # from it follows also what LQR draws when it is made
+    env = DummyVecEnv([lambda: Monitor(gym.make(run.arguments["env"], **{**run.env_kwargs, **own}))])
+    if not run.is_of_suite:
+        env.seed(seed)
     try:
         returns, _ = evaluate_policy(model, env, n_eval_episodes=episodes, return_episode_rewards=True)
     finally:
@@ -85,8 +91,6 @@ def _returns(model: SAC, run: Run, episodes: int, seed: int) -> list[float]:
     return [float(value) for value in returns]
 
 
-def _training_seconds(evaluations: Path) -> float | None:
-    if not evaluations.exists():
-        return None
-    with np.load(evaluations) as file:
-        return float(file["training_seconds"]) if "training_seconds" in file else None
+def _training_seconds(run: Run) -> float | None:
+    seconds = (run.evaluations or {}).get("training_seconds")
+    return None if seconds is None else float(seconds)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sb3_crc.envs.tasks import NAMESPACE
-from sb3_crc.experiments.runs import FINAL, PROVENANCE, Run, read_json
+from sb3_crc.experiments.runs import FINAL, PROVENANCE, Run
 from sb3_crc.export import ENVIRONMENT_ARGUMENTS
 from sb3_crc.presets import PRESETS
 
@@ -36,7 +35,7 @@ def model_card(run: Run, repo_id: str, files: Mapping[str, str | float], *, agen
     :param files: names of what lies beside the page -> what there is to say of it; of ``replay.mp4`` the return of its episode
     :return: Markdown, with a YAML header
     """
-    final = read_json(run.folder / FINAL) if (run.folder / FINAL).exists() else None
+    final = run.final
     header = yaml.safe_dump(_metadata(run, final), sort_keys=False, allow_unicode=True)
     sections = [
         f"---\n{header}---",
@@ -131,7 +130,7 @@ def _score(run: Run, final: Mapping[str, Any] | None, files: Mapping[str, str | 
 
 def _usage(run: Run, repo_id: str, files: Mapping[str, str | float]) -> list[str]:
     paragraphs = []
-    if POLICY in files and run.arguments["env"].startswith(f"{NAMESPACE}/"):
+    if POLICY in files and run.is_of_suite:
         arguments = "".join(f", {name}={value!r}" for name, value in environment_arguments(run).items())
         paragraphs += [
             f"With sb3_crc installed. `{POLICY}` holds numbers and a description, and reading it executes nothing, so nobody "
@@ -175,8 +174,7 @@ def _training(run: Run) -> list[str]:
         f"```yaml\n{settings}```",
         f"```console\npython train.py --algo {run.preset} --env {run.arguments['env']} {flags}\n```",
     ]
-    if (run.folder / PROVENANCE).exists():
-        made = read_json(run.folder / PROVENANCE)
+    if made := run.provenance:
         versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
         machine = made["machine"]
         device = machine["gpu"] or f"{machine['processor']}, {machine['threads']} thread(s)"

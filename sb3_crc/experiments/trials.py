@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_crc.atomic import atomic_write
 from sb3_crc.experiments.final import final_returns
 from sb3_crc.experiments.runs import Run
 
@@ -23,27 +24,27 @@ FIELDS = (
     "final_returns",
     "minutes",
     "note",
+    "settings",
 )
 
 
-def read_trial(run: Path) -> dict[str, Any]:
+def read_trial(run: Run) -> dict[str, Any]:
     """
-    Read a run's folder, finished or not.
+    Read what a run has written, finished or not.
 
-    :param run: ``<logs>/<algo>/<env>_<number>`` of rl_zoo3
+    :param run: whose folder is read
     :return: a row of the table: curve is "environment steps:mean return" of each evaluation, minutes are those of
         training and evaluations, settings are the hyper-parameters as JSON
-    :raises FileNotFoundError: if the folder is no run
+    :raises FileNotFoundError: if it has no log of episodes
+    :raises ValueError: if one of its files cannot be read, naming it
     """
-    described = Run(run)
-    row = {"trial": str(run), "algo": described.preset, "env": described.arguments["env"], "seed": described.seed}
-    row["settings"] = json.dumps(described.settings, default=str)
-    if (run / "evaluations.npz").exists():
-        with np.load(run / "evaluations.npz") as evaluations:
-            steps, returns = evaluations["timesteps"] * described.action_repeat, evaluations["results"].mean(axis=1)
+    row = {"trial": str(run.folder), "algo": run.preset, "env": run.arguments["env"], "seed": run.seed}
+    row["settings"] = json.dumps(run.settings, default=str)
+    if (evaluations := run.evaluations) is not None:
+        steps, returns = evaluations["timesteps"] * run.action_repeat, evaluations["results"].mean(axis=1)
         row["environment_steps"] = int(steps[-1])
         row["curve"] = " ".join(f"{step}:{value:.0f}" for step, value in zip(steps, returns, strict=True))
-    episodes = (run / "0.monitor.csv").read_text().splitlines()[2:]
+    episodes = (run.folder / "0.monitor.csv").read_text(encoding="utf-8").splitlines()[2:]
     if episodes:
         row["minutes"] = round(float(episodes[-1].split(",")[2]) / 60, 1)
     return row
@@ -53,25 +54,39 @@ def record_trials(runs: Sequence[Path], table: Path, *, episodes: int = 10, note
     """
     Write runs into a table, each in the place of what it said before.
 
-    :param runs: folders as for :func:`read_trial`
+    :param runs: folders, ``<logs>/<algo>/<env>_<number>`` of rl_zoo3
     :param table: CSV file, made if it is missing
     :param episodes: fresh ones on which the final policy of a finished run is evaluated; 0: none
     :param note: written beside them
     :return: the new rows
+    :raises FileNotFoundError: if a folder is no run
+    :raises ValueError: if the file is another table, which stays as it is
     """
+    old = _read_table(table)
     rows = []
-    for run in runs:
+    for run in map(Run, runs):
         row = read_trial(run) | {"note": note}
-        if episodes > 0 and Run(run).model.exists():
-            returns = final_returns(Run(run), episodes=episodes)
-            row |= {"final_mean": round(float(np.mean(returns)), 1), "final_std": round(float(np.std(returns, ddof=1)), 1)}
+        if episodes > 0 and run.model.exists():
+            returns = final_returns(run, episodes=episodes)
+            row["final_mean"] = round(float(np.mean(returns)), 1)
+            row["final_std"] = round(float(np.std(returns, ddof=1)), 1) if len(returns) > 1 else ""
             row["final_returns"] = " ".join(f"{value:.0f}" for value in returns)
         rows.append(row)
-    old = list(csv.DictReader(table.open())) if table.exists() else []
     names = {row["trial"] for row in rows}
     table.parent.mkdir(parents=True, exist_ok=True)
-    with table.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*FIELDS, "settings"])
+    with atomic_write(table) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, FIELDS)
         writer.writeheader()
         writer.writerows([*(row for row in old if row["trial"] not in names), *rows])
     return rows
+
+
+def _read_table(table: Path) -> list[dict[str, Any]]:
+    if not table.exists():
+        return []
+    with table.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        columns = tuple(reader.fieldnames or ())
+        if set(columns) != set(FIELDS):
+            raise ValueError(f"{table} is no table of trials: its columns are {', '.join(columns) or 'none'}")
+        return list(reader)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_crc.experiments.runs import FINAL, Run, read_json
+from sb3_crc.experiments.runs import Run
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -62,12 +62,12 @@ def read_progress(run: Run, *, now: float | None = None) -> Progress:
     """
     log, rows = run.folder / "progress.csv", _rows(run.folder / "progress.csv")
     logged = [(int(float(row[STEPS])), float(row[ELAPSED])) for row in rows if row.get(STEPS) and row.get(ELAPSED)]
-    returns = _evaluations(run.folder / "evaluations.npz")
+    returns = _returns(run)
     budget = run.budget // run.action_repeat
     steps = max([int(float(row[STEPS])) for row in rows if row.get(STEPS)] or [0])
     status, final = run.status, None
-    if status == "finished":
-        steps, final = budget, float(np.mean(read_json(run.folder / FINAL)["returns"]))
+    if (scored := run.final) is not None:
+        steps, final = budget, float(np.mean(scored["returns"]))
     elif status == "unevaluated":
         steps = budget
     left = None if status != "unfinished" else _seconds_left(logged, budget)
@@ -103,7 +103,7 @@ def progress_table(progresses: Sequence[Progress]) -> Table:
             Text(one.name),
             one.status,
             f"{min(1.0, one.agent_steps / max(1, one.budget)):.0%}",
-            "" if one.seconds_left is None else _duration(one.seconds_left),
+            "" if one.seconds_left is None else duration(one.seconds_left),
             last if one.final is None else f"{last} final {one.final:.0f}",
             *("" if name not in one.instruments else f"{one.instruments[name]:.3g}" for name in shown),
         )
@@ -131,12 +131,12 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return list(csv.DictReader(whole.splitlines()))
 
 
-def _evaluations(path: Path) -> tuple[float, ...]:
+def _returns(run: Run) -> tuple[float, ...]:
     try:
-        with np.load(path) as file:
-            return tuple(float(np.mean(returns)) for returns in file["results"])
-    except (OSError, ValueError, KeyError):  # not there yet
-        return ()
+        evaluations = run.evaluations
+    except (FileNotFoundError, ValueError):  # half written
+        evaluations = None
+    return () if evaluations is None else tuple(float(np.mean(returns)) for returns in evaluations["results"])
 
 
 def _seconds_left(logged: Sequence[tuple[int, float]], budget: int) -> float | None:
@@ -156,8 +156,9 @@ def _in_total(progresses: Sequence[Progress]) -> str:
     text = f"{ended} of {len(progresses)} runs ended, {done / max(1, budget):.0%} of all decisions made"
     speed = sum((one.budget - one.agent_steps) / one.seconds_left for one in progresses if one.seconds_left)
     failed = any(one.status == "failed" for one in progresses)
-    return text if speed == 0 or failed else f"{text}, about {_duration((budget - done) / speed)} left"
+    return text if speed == 0 or failed else f"{text}, about {duration((budget - done) / speed)} left"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """:return: hours, minutes and seconds, as ``1:30:00``"""
     return str(timedelta(seconds=round(seconds)))

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
-from sb3_crc.experiments.evidence import BEST, compare_with, goals, probability_of_reaching, results_page
-from sb3_crc.experiments.landmarks import measure_landmarks
+from sb3_crc.experiments.evidence import BEST, goals, probability_of_reaching, results_page
 from sb3_crc.experiments.published import SIX_TASKS
 from sb3_crc.experiments.scores import COLUMNS
 
@@ -81,27 +79,3 @@ def test_goals_are_published_figures() -> None:
     assert [round(values[0]) for values in found.values()] == [813, 636, 355, 832, 793, 490]
     assert [round(values[1]) for values in found.values()] == [851, 917, 518, 971, 981, 869]
     assert set(BEST) == set(SIX_TASKS) and goals("humanoid-run") == {}
-
-
-def test_a_reproduction_is_compared_with_what_is_committed(tmp_path: Path) -> None:
-    committed = scores(tmp_path / "committed.csv", "crc", {1: 800, 2: 820, 3: 840})
-    found = compare_with(committed, scores(tmp_path / "new.csv", "crc", {1: 812}))
-    assert found["committed"] == {1: 800, 2: 820, 3: 840} and found["reproduced"] == {1: 812}
-    # the prediction interval of one more draw: mean +- t(0.975, 2) s sqrt(1 + 1/3)
-    assert np.allclose(found["interval"], (820 - 4.3027 * 20 * np.sqrt(4 / 3), 820 + 4.3027 * 20 * np.sqrt(4 / 3)), atol=0.01)
-
-    run = CliRunner().invoke(app, ["reproduced", str(tmp_path / "new.csv"), str(committed)])
-    assert run.exit_code == 0 and "expected if nothing has changed: 721 to 919" in run.stdout
-    scores(tmp_path / "new.csv", "crc", {1: 500})
-    run = CliRunner().invoke(app, ["reproduced", str(tmp_path / "new.csv"), str(committed)])
-    assert run.exit_code == 1 and "outside of it" in run.stderr
-    with pytest.raises(ValueError, match="has no final score of rad on cartpole-swingup"):
-        compare_with(committed, scores(tmp_path / "rad.csv", "rad", {1: 500}))
-
-
-def test_landmarks_are_repeatable_and_know_nothing() -> None:
-    found = measure_landmarks(["cartpole-swingup"], episodes=1)
-    again = measure_landmarks(["cartpole-swingup"], episodes=1)
-    assert found["returns"] == again["returns"]
-    assert 0 < found["returns"]["cartpole-swingup"]["random"][0] < 300
-    assert found["returns"]["cartpole-swingup"]["zero"][0] < 50  # it hangs down

@@ -160,7 +160,7 @@ def test_mistakes_are_one_line_and_leave_what_was_there(tmp_path: Path) -> None:
     output.write_text("the last one")
     (tmp_path / "empty").mkdir()
     half = make_run(tmp_path / "half", "crc")
-    (half / "evaluations.npz").write_bytes(b"half")
+    (half / "evaluations.npz").write_bytes(b"PK\3\4 half")
     torn = make_run(tmp_path / "torn", "crc")
     (torn / "torn.png").write_bytes(b"half")
     for source, message in (

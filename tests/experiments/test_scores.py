@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
@@ -67,6 +68,20 @@ def test_the_final_policy_is_scored_on_fresh_episodes(folder: Path) -> None:
         assert current["first_seed"].nunique() == 2 and (current["first_seed"] > FIRST_EVALUATION).all()
         assert scores.final["seconds"].tolist() == [float(data["training_seconds"])] * 2
     assert set(scores.table["render_quality"]) == {"fast"} and "torch" in scores.table["versions"][0]
+
+
+def test_an_environment_of_the_users_is_seeded_too(tmp_path: Path) -> None:
+    run = tmp_path / "state_sac" / "Pendulum-v1_1"
+    (run / "Pendulum-v1").mkdir(parents=True)
+    (run / "Pendulum-v1" / "args.yml").write_text("{algo: state_sac, env: Pendulum-v1, seed: 0, n_timesteps: 10}")
+    (run / "Pendulum-v1" / "config.yml").write_text("{env_kwargs: {g: 9.0}}")
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu").save(run / "Pendulum-v1.zip")
+    first, again, other = (final.final_returns(Run(run), episodes=2, seed=seed) for seed in (1, 1, 2))
+    assert first == again != other and len(set(first)) == 2
+    arguments = run / "Pendulum-v1" / "args.yml"
+    arguments.write_text(arguments.read_text().replace("state_sac", "td3"))
+    with pytest.raises(ValueError, match="'td3'"):
+        final.final_returns(Run(run))
 
 
 def test_scores_come_back_from_csv(folder: Path, tmp_path: Path) -> None:

@@ -48,7 +48,21 @@ def test_trials_are_read_evaluated_and_replaced(tmp_path: Path) -> None:
         assert row["note"] == ("stopped" if row["trial"] == str(unfinished) else "")
         assert json.loads(row["settings"])["gamma"] == 0.9
         assert bool(row["final_returns"]) == (row["trial"] == str(run))
-    assert set(FIELDS) < set(written[0])
+    assert list(FIELDS) == list(written[0])
+
+
+def test_another_table_stays_as_it_is(tmp_path: Path) -> None:
+    run, table = make_run(tmp_path / "one", finished=False), tmp_path / "scores.csv"
+    for content, message in (("method,return\ncrc,1\n", "its columns are method, return"), ("", "its columns are none")):
+        table.write_text(content)
+        with pytest.raises(ValueError, match=rf"scores\.csv is no table of trials: {message}"):
+            record_trials([run], table)
+        assert table.read_text() == content
+
+
+def test_one_episode_has_no_spread(tmp_path: Path) -> None:
+    (row,) = record_trials([make_run(tmp_path / "one", finished=True)], tmp_path / "trials.csv", episodes=1)
+    assert row["final_std"] == "" and float(row["final_returns"]) == pytest.approx(row["final_mean"], abs=0.5)
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

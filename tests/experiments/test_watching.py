@@ -50,9 +50,11 @@ def test_half_written_files_are_taken_as_far_as_they_are_whole(tmp_path: Path) -
     folder = running(tmp_path, "500,100,0.5,", "1000,200,0.25,")
     with (folder / "progress.csv").open("a") as log:
         log.write("15")
-    (folder / "evaluations.npz").write_bytes(b"PK half")
-    progress = progress_of(tmp_path)
-    assert progress.agent_steps == 1_000 and progress.returns == ()
+    whole = (folder / "evaluations.npz").read_bytes()
+    for half in (b"", b"PK half", whole[: len(whole) // 2]):
+        (folder / "evaluations.npz").write_bytes(half)
+        progress = progress_of(tmp_path)
+        assert progress.agent_steps == 1_000 and progress.returns == ()
     (folder / "progress.csv").unlink()
     assert progress_of(tmp_path).agent_steps == 0
 

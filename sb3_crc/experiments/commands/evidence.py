@@ -71,7 +71,7 @@ def reproduced(
     ],
 ) -> object:
     """Do runs agree with scores that are committed? The exit code is 1 if they do not."""
-    from sb3_crc.experiments.evidence import compare_with
+    from sb3_crc.experiments.reproduction import compare_with
 
     found = compare_with(committed, runs)
     for name in ("committed", "reproduced"):

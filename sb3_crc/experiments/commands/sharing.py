@@ -52,10 +52,10 @@ def share(run: Path, repo_id: str, *, output: Path | None, filmed: bool, private
     :raises ConnectionError: if the Hub cannot be reached or refuses
     """
     from sb3_crc.experiments.hub import upload, write_repository
-    from sb3_crc.experiments.runs import FINAL, Run
+    from sb3_crc.experiments.runs import Run
 
     found = Run(run)
-    if not (found.folder / FINAL).exists():
+    if found.final is None:
         tell(f"not evaluated, and the page says so; before it is shared: sb3-crc evaluate {run}")
     if filmed and importlib.util.find_spec("av") is None:
         tell("no film: install the extra 'video' (pip install 'sb3-crc[video]')")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_crc.experiments.runs import PROVENANCE, Run, find_runs, read_json
+from sb3_crc.experiments.runs import Run, find_runs
 
 #: Beginnings of the names of logged values that are shown as instruments
 INSTRUMENTS = ("train/", "representation/", "eval/", "rollout/", "generalization/", "time/updates_per_second")
@@ -78,10 +78,10 @@ def all_contents(folders: Sequence[Path]) -> list[RunContents]:
 
 
 def _contents(run: Run, name: str) -> RunContents:
-    described = read_json(run.folder / PROVENANCE) if (run.folder / PROVENANCE).exists() else {}
     commands = sorted(run.folder.glob("*/command.txt"))
     command = commands[0].read_text(encoding="utf-8").strip() if commands else ""
-    return RunContents(run, name, dict(_flat(run.settings)), command, described, _instruments(run.folder / "progress.csv"))
+    instruments = _instruments(run.folder / "progress.csv")
+    return RunContents(run, name, dict(_flat(run.settings)), command, run.provenance, instruments)
 
 
 def differing_settings(contents: Sequence[RunContents]) -> dict[str, list[str]]:

@@ -23,10 +23,10 @@ from sb3_crc.experiments.report.contents import (
     folder_media,
     run_media,
 )
-from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, read_scores
+from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, one_line, read_scores
 from sb3_crc.experiments.statistics import Axis, curve, training_runs
 from sb3_crc.experiments.table_formats import Grid, grids
-from sb3_crc.experiments.tables import allowed_budgets, check_whole, paper_table, same_steps
+from sb3_crc.experiments.tables import fits, paper_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,14 +86,10 @@ def write_report(sources: Sequence[Path], output: Path, *, title: str | None = N
 
 def _scores(scores: Scores) -> str:
     final, parts = scores.final, []
-    check_whole(final)
     shown = np.zeros(len(final), bool)
     for name in STEPS:
-        fits = [
-            any(same_steps(budget, allowed) for allowed in allowed_budgets(name, task))
-            for task, budget in zip(final["task"], final["budget"], strict=True)
-        ]
-        chosen = np.array(fits, bool) & ~shown
+        fitting = [fits(name, task, budget) for task, budget in zip(final["task"], final["budget"], strict=True)]
+        chosen = np.array(fitting, bool) & ~shown
         if chosen.any():
             try:
                 table = paper_table(Scores(final[chosen], ()), name)
@@ -217,16 +213,8 @@ def _settings_section(contents: Sequence[RunContents]) -> str:
 def _runs_section(contents: Sequence[RunContents]) -> str:
     rows = []
     for one in contents:
-        machine, versions = one.provenance.get("machine") or {}, one.provenance.get("versions") or {}
-        rows.append(
-            [
-                one.name,
-                one.run.status,
-                ", ".join(f"{name} {value}" for name, value in machine.items() if value is not None),
-                ", ".join(f"{name} {value}" for name, value in versions.items()),
-                str(one.provenance.get("git_revision") or ""),
-            ]
-        )
+        about = [one_line(one.provenance.get(name)) for name in ("machine", "versions")]
+        rows.append([one.name, one.run.status, *(text or "" for text in (*about, one.provenance.get("git_revision")))])
     commands = "".join(
         f"<h3>{html.escape(one.name)}</h3><pre>{html.escape(one.command or 'not recorded')}</pre>" for one in contents
     )
