@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sb3_crc.experiments.comparison_summary import about, count, listed, machines, markdown, summary, write_rows
+from sb3_crc.experiments.comparison_summary import count, machines, summary, write_rows
 from sb3_crc.experiments.scores import Scores, final_means, one_protocol
 from sb3_crc.experiments.statistics import (
     HIGHEST_RETURN,
@@ -15,7 +15,6 @@ from sb3_crc.experiments.statistics import (
     Curve,
     Difference,
     Estimate,
-    ScoreMatrices,
     aggregate,
     curve,
     differences,
@@ -31,17 +30,12 @@ FIGURES = ("sample_efficiency.png", "wall_time.png", "improvement.png", "profile
 DOTS_PER_INCH = 150
 STEPS, HOURS, RETURN = "environment steps", "hours of training, without evaluations", "return"
 
-#: task -> name of a policy to compare with -> its return
-References = Mapping[str, Mapping[str, float]]
-Weights = tuple[float, float, float]
-
 
 def draw_comparison(
     scores: Scores,
     folder: Path,
     *,
     baseline: str | None,
-    references: References | None = None,
     allow_mixed: bool = False,
     reps: int = REPS,
 ) -> list[Path]:
@@ -52,7 +46,6 @@ def draw_comparison(
     :param scores: of the runs
     :param folder: to write to
     :param baseline: method that the others are compared with; None: the first
-    :param references: policies to compare with, as horizontal lines in ``tasks.png``
     :param allow_mixed: let runs of different protocols stand beside each other
     :param reps: bootstrap samples
     :return: what was written
@@ -82,7 +75,7 @@ def draw_comparison(
     notes["About wall time"] = [*(one for one in seconds.left_out if one not in steps.left_out), *machines(current)]
     if steps.methods:
         figures["sample_efficiency.png"] = _curves_figure(steps.methods, styles, STEPS)
-        figures["tasks.png"] = _tasks_figure(scores.table, styles, references or {})
+        figures["tasks.png"] = _tasks_figure(scores.table, styles)
     if seconds.methods:
         figures["wall_time.png"] = _curves_figure(seconds.methods, styles, HOURS)
     if compared:
@@ -101,45 +94,6 @@ def draw_comparison(
     (folder / "summary.md").write_text(text, encoding="utf-8")
     write_rows(folder / "summary.csv", matrices, aggregates, compared)
     return [folder / name for name in (*figures, "summary.md", "summary.csv")]
-
-
-def draw_weights(
-    scores: Scores, folder: Path, weights: Mapping[str, Weights], *, allow_mixed: bool = False, reps: int = REPS
-) -> list[Path]:
-    """
-    Write ``weights.png``, a triangle with a point for each convex combination of the losses' weights, coloured by the mean
-    final return, and ``weights.md`` with the numbers and what was left out.
-
-    :param scores: of the runs
-    :param folder: to write to
-    :param weights: method -> shares of contrastive, reconstruction and consistency, which sum to 1; others are not drawn
-    :param allow_mixed: as for :func:`draw_comparison`
-    :param reps: bootstrap samples
-    :return: what was written
-    :raises ValueError: if weights are no shares, or no task and seed has a final score of every method that has some
-    :raises MixedProtocols: as for :func:`draw_comparison`
-    """
-    for method, shares in weights.items():
-        if min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
-            raise ValueError(f"weights of {method} are no shares of 1: {shares}")
-    final = scores.final[scores.final["method"].isin(list(weights))]
-    matrices = score_matrices(final_means(one_protocol(final, allow_mixed=allow_mixed)))
-    if not matrices.scores:
-        raise ValueError("no triangle to draw: no task and seed has a final score of every method with convex weights")
-    means = {method: found["mean"] for method, found in aggregate(matrices.scores, reps=reps).items()}
-    folder.mkdir(parents=True, exist_ok=True)
-    picture, text = folder / "weights.png", folder / "weights.md"
-    figure = _weights_figure({method: (weights[method], mean.value) for method, mean in means.items()}, matrices)
-    figure.savefig(picture, dpi=DOTS_PER_INCH)
-    rows = [(method, *(f"{share:.3g}" for share in weights[method]), mean.text()) for method, mean in means.items()]
-    lines = ["# Convex weights", "", about(matrices), ""]
-    lines += markdown(("method", "contrastive", "reconstruction", "consistency", "mean final return"), rows)
-    lines.append("")
-    absent = [f"{method}: no final score" for method in weights if method not in means]
-    missing = [str(one) for one in scores.missing if one.method in weights]
-    lines += listed("Left out", [*absent, *matrices.dropped, *missing])
-    text.write_text("\n".join(lines), encoding="utf-8")
-    return [picture, text]
 
 
 def _style(number: int) -> dict[str, Any]:
@@ -207,7 +161,7 @@ def _finish(axes: Any, abscissa: str) -> None:
     axes.set_ylim(bottom=axes.get_ylim()[0] if axes.dataLim.y0 < 0 else 0.0)
 
 
-def _tasks_figure(table: "pd.DataFrame", styles: Mapping[str, Mapping[str, Any]], references: References) -> Any:
+def _tasks_figure(table: "pd.DataFrame", styles: Mapping[str, Mapping[str, Any]]) -> Any:
     runs, _ = training_runs(table, "environment_steps")
     methods, tasks = list(dict.fromkeys(key[0] for key in runs)), list(dict.fromkeys(key[1] for key in runs))
     own = {(m, t): [run for key, run in runs.items() if key[:2] == (m, t)] for m in methods for t in tasks}
@@ -234,10 +188,6 @@ def _tasks_figure(table: "pd.DataFrame", styles: Mapping[str, Mapping[str, Any]]
             mean = np.mean([np.interp(shared, *run) for run in own[method, task]], axis=0) if len(shared) else shared
             every = max(1, len(shared) // 6)
             (handles[labels[method]],) = axes.plot(shared, mean, **style, markevery=every, markersize=4, linewidth=1.8)
-        for line, (name, value) in zip(("--", ":", "-."), references.get(task, {}).items(), strict=False):
-            axes.axhline(value, linestyle=line, color="black", linewidth=1)
-            at = (0.02, value)
-            axes.annotate(f"{name} ({value:.0f})", at, (0, 2), axes.get_yaxis_transform(), "offset points", fontsize=8)
         axes.set_title(task, fontsize=11)
         axes.grid(alpha=0.3)
         _finish(axes, STEPS)
@@ -305,35 +255,6 @@ def _profile_figure(profiles: Mapping[str, Curve], styles: Mapping[str, Mapping[
     axes.set_ylabel("share of runs with a return above x")
     axes.set_xlim(0, HIGHEST_RETURN)
     axes.set_ylim(-0.02, 1.04)
-    return figure
-
-
-def _weights_figure(points: Mapping[str, tuple[Weights, float]], matrices: ScoreMatrices) -> Any:
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])  # contrastive, reconstruction, consistency
-    at_one_place: dict[Weights, list[float]] = {}
-    for (first, second, third), value in points.values():
-        at_one_place.setdefault((round(first, 6), round(second, 6), round(third, 6)), []).append(value)
-    places = np.array(list(at_one_place)) @ corners
-    figure = _new_figure(5.6)
-    axes = figure.subplots()
-    axes.set_aspect("equal")
-    axes.axis("off")
-    for share in (0.25, 0.5, 0.75):
-        for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            ends = [share * corners[first] + (1 - share) * corners[other] for other in (second, third)]
-            axes.plot(*np.transpose(ends), color="0.85", linewidth=0.8, zorder=0)
-    axes.plot(*np.transpose(corners[[0, 1, 2, 0]]), color="0.4", linewidth=1, zorder=1)
-    colours = [float(np.mean(values)) for values in at_one_place.values()]
-    drawn = axes.scatter(*places.T, c=colours, s=150, cmap="viridis", edgecolors="black", linewidths=0.8, zorder=2)
-    for place, values in zip(places, at_one_place.values(), strict=True):
-        text = " / ".join(f"{value:.0f}" for value in values)
-        axes.annotate(text, place, (9, 6), textcoords="offset points", fontsize=10, zorder=3)
-    for (x, y), name, offset in zip(corners, ("contrastive", "reconstruction", "consistency"), (-22, -22, 30), strict=True):
-        axes.annotate(f"{name} alone", (x, y), (0, offset), textcoords="offset points", ha="center", va="center", fontsize=11)
-    axes.set_xlim(-0.12, 1.16)
-    axes.set_ylim(-0.12, 1.0)
-    figure.colorbar(drawn, ax=axes, label="mean final return", shrink=0.75)
-    figure.supxlabel(about(matrices, names=len(matrices.tasks) < 3), fontsize=9)
     return figure
 
 

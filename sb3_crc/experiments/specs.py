@@ -24,8 +24,7 @@ from stable_baselines3 import SAC
 
 from sb3_crc.configurations import configuration_file, read_settings, with_overrides
 from sb3_crc.crc_sac import CRCSAC
-from sb3_crc.envs.tasks import default_action_repeat, environment_id
-from sb3_crc.objectives import objective_weights
+from sb3_crc.envs.tasks import default_action_repeat, environment_id, split_task
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
@@ -65,7 +64,8 @@ class RunSpec:
     :param eval_every: environment steps between two evaluations of the current policy
     :param eval_episodes: of each of them, and of the final policy
     :param settings: of rl_zoo3 for this environment, complete
-    :raises ValueError: if steps are no multiple of the action repeat, or a setting does not exist or cannot work
+    :raises ValueError: if steps are no multiple of the action repeat, the seed is negative (rl_zoo3 would draw one), or a
+        setting does not exist or cannot work
     """
 
     method: str
@@ -85,8 +85,9 @@ class RunSpec:
                 raise ValueError(
                     f"{self.method} on {self.task}: {name}={value} must be a positive multiple of the action repeat, {repeat}"
                 )
-        if self.eval_episodes < 1:
-            raise ValueError(f"{self.method} on {self.task}: eval_episodes={self.eval_episodes} must be at least 1")
+        for name, least in (("eval_episodes", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{self.method} on {self.task}: {name}={getattr(self, name)} must be at least {least}")
         learning_starts = self.settings.get("learning_starts", 0)
         if self.agent_steps <= learning_starts:
             raise ValueError(
@@ -101,8 +102,7 @@ class RunSpec:
     @property
     def action_repeat(self) -> int:
         """Environment steps per agent step."""
-        own = (self.settings.get("env_kwargs") or {}).get("action_repeat")
-        return int(own or default_action_repeat(self.task))
+        return _action_repeat(self.task, self.settings)
 
     @property
     def agent_steps(self) -> int:
@@ -123,23 +123,31 @@ def compared(
     seeds: Sequence[int],
     *,
     env_steps: int,
-    eval_every: int,
+    eval_every: int | None = None,
     eval_episodes: int = 10,
     conf_file: Path | None = None,
 ) -> list[RunSpec]:
     """
     :param presets: presets or stock algorithms; each is its own method
-    :param tasks: domain-task
+    :param tasks: domain-task, or the whole ids of such
     :param seeds: of the trainings; the same for all methods
-    :param env_steps: see :class:`RunSpec`, like what follows
+    :param env_steps: see :class:`RunSpec`
+    :param eval_every: see there; None: a twentieth of the budget, in whole agent steps
+    :param eval_episodes: see there
     :param conf_file: configuration of all of them; None: each preset's own file
     :return: a run for each of task, seed and preset, in this order, so that what is compared comes together
     :raises ValueError: for unknown names or values that cannot work, before anything runs
     """
     _check_unique("presets", presets)
-    variants = {preset: {"preset": preset} for preset in presets}
-    protocol = {"env_steps": env_steps, "eval_every": eval_every, "eval_episodes": eval_episodes}
-    return _grid(variants, tasks, seeds, conf_file=conf_file, **protocol)
+    return _grid(
+        {preset: {"preset": preset} for preset in presets},
+        tasks,
+        seeds,
+        env_steps=env_steps,
+        eval_every=eval_every,
+        eval_episodes=eval_episodes,
+        conf_file=conf_file,
+    )
 
 
 def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
@@ -169,7 +177,7 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
         content["tasks"],
         range(seeds) if isinstance(seeds, int) else seeds,
         env_steps=content["env_steps"],
-        eval_every=content.get("eval_every", max(1, content["env_steps"] // 20)),
+        eval_every=content.get("eval_every"),
         eval_episodes=content.get("eval_episodes", 10),
         conf_file=None if conf_file is None else file.parent / conf_file,
     )
@@ -190,20 +198,6 @@ def _check_types(file: Path, content: Mapping[str, Any]) -> None:
             raise ValueError(f"{file}: {key} must be {SWEEP_KEYS[key][1]}; {wrong[0]!r} is among them")
 
 
-def convex_weights(file: Path) -> dict[str, tuple[float, float, float]]:
-    """
-    :param file: a sweep
-    :return: variant -> weights of contrastive, reconstruction and consistency, in shares of 1; none for a variant without them
-    """
-    found = {}
-    for spec in read_sweep(file):
-        weights = objective_weights(spec.settings.get("objectives", {}))
-        own = [weights.get(name, 0.0) for name in ("contrastive", "reconstruction", "consistency")]
-        if sum(own) > 0:
-            found[spec.method] = own[0] / sum(own), own[1] / sum(own), own[2] / sum(own)
-    return found
-
-
 def _check_unique(name: str, values: Sequence[Any]) -> None:
     """:raises ValueError: naming what is there twice"""
     twice = [value for place, value in enumerate(values) if value in values[:place]]
@@ -211,15 +205,22 @@ def _check_unique(name: str, values: Sequence[Any]) -> None:
         raise ValueError(f"{name}: {twice[0]!r} is there twice")
 
 
+def _action_repeat(task: str, settings: Mapping[str, Any]) -> int:
+    own = (settings.get("env_kwargs") or {}).get("action_repeat")
+    return int(own or default_action_repeat(task))
+
+
 def _grid(
     variants: Mapping[str, Mapping[str, Any]],
     tasks: Iterable[str],
     seeds: Iterable[int],
     *,
+    env_steps: int,
+    eval_every: int | None,
+    eval_episodes: int,
     conf_file: Path | None,
-    **protocol: Any,
 ) -> list[RunSpec]:
-    tasks, seeds = list(tasks), list(seeds)
+    tasks, seeds = ["-".join(split_task(task)) for task in tasks], list(seeds)  # an unknown task is refused before all else
     named: dict[str, Sequence[Any]] = {"tasks": tasks, "seeds": seeds, "variants": list(variants)}
     for name, values in named.items():
         if not values:
@@ -239,11 +240,13 @@ def _grid(
                 settings = {**PRESETS[preset], **settings}
             settings = with_overrides(settings, overrides)
             settings.pop("n_timesteps", None)  # the budget decides
-            resolved[method, task] = preset, settings
+            repeat = _action_repeat(task, settings)
+            every = max(1, env_steps // repeat // 20) * repeat if eval_every is None else eval_every
+            resolved[method, task] = preset, every, settings
     return [
-        RunSpec(method=method, preset=preset, task=task, seed=seed, settings=settings, **protocol)
+        RunSpec(method, preset, task, seed, env_steps, every, eval_episodes, settings)
         for task in tasks
         for seed in seeds
         for method in variants
-        for preset, settings in [resolved[method, task]]
+        for preset, every, settings in [resolved[method, task]]
     ]

@@ -53,7 +53,8 @@ def test_a_dry_run_starts_nothing(tmp_path: Path) -> None:
     [
         (["--presets", "crc,sacc"], "preset of 'sacc'"),
         (["--env-steps", "1001"], "env_steps=1001 must be a positive multiple of the action repeat, 8"),
-        (["--task", "cartpole-swingdown"], "cartpole-swingdown"),
+        (["--task", "cartpole-swingdown"], "Unknown task 'cartpole-swingdown'"),
+        (["--task", "cartpole-swingdown", "--dry-run"], "Did you mean 'cartpole-swingup'"),
         (["--conf-file", "nowhere.yml"], "nowhere.yml"),
     ],
 )

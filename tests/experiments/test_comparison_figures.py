@@ -1,6 +1,7 @@
 """Figures of comparisons show something, and summaries say what is missing."""
 
 import csv
+import re
 from pathlib import Path
 
 import matplotlib.figure
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
-from sb3_crc.experiments.comparison_figures import FIGURES, draw_comparison, draw_weights
+from sb3_crc.experiments.comparison_figures import FIGURES, draw_comparison
 from sb3_crc.experiments.scores import COLUMNS, Missing, MixedProtocols, Scores
 
 pytest.importorskip("rliable")
@@ -49,8 +50,7 @@ def test_everything_is_written_and_what_is_missing_is_listed(tmp_path: Path) -> 
     scores = scores_of({"crc": 800, "rad": 600, "sac": 601})
     table = scores.table[scores.table["run"] != "rad/walker-walk/2"]
     scores = Scores(table, (Missing("rad", "walker-walk", 2, "failed"),))
-    references = {TASKS[0]: {"random policy": 30.0}}
-    written, summary = draw(scores, tmp_path / "new", baseline="rad", references=references)
+    written, summary = draw(scores, tmp_path / "new", baseline="rad")
     assert written == {*FIGURES, "summary.md", "summary.csv"}
     assert "- rad on walker-walk, seed 2: failed" in summary
     assert "- seed 2: no rad on walker-walk" in summary
@@ -104,6 +104,20 @@ def test_runs_that_have_not_ended_give_curves(tmp_path: Path) -> None:
     assert "No final scores to compare." in summary
 
 
+def test_a_method_may_be_called_anything(tmp_path: Path) -> None:
+    _, summary = draw(scores_of({"crc": 500, "a|b": 500}), tmp_path)
+    tables = [line for line in summary.splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in tables} == {5, 6}  # of four columns, and of five
+    assert sum(line.startswith("| a\\|b |") for line in tables) == 2
+
+
+def test_an_evaluation_with_a_gap_is_refused(tmp_path: Path) -> None:
+    table = scores_of({"crc": 500, "rad": 500}).table
+    first = table[(table["policy"] == "final") & (table["run"] == "rad/walker-walk/1")].index[0]
+    with pytest.raises(ValueError, match="the final evaluation of rad/walker-walk/1 is not whole: 1 of 2 episodes"):
+        draw(Scores(table.drop(first), ()), tmp_path)
+
+
 def test_refusals(tmp_path: Path) -> None:
     scores = scores_of({"crc": 800, "rad": 600})
     with pytest.raises(ValueError, match="no method 'sac' to compare with, only crc, rad"):
@@ -118,17 +132,3 @@ def test_refusals(tmp_path: Path) -> None:
         draw(Scores(mixed[mixed["policy"] == "current"], ()), tmp_path)
     assert not list(tmp_path.iterdir())
     assert draw(Scores(mixed, ()), tmp_path, allow_mixed=True)[0] >= set(FIGURES)
-
-
-def test_triangle_of_weights(tmp_path: Path) -> None:
-    scores = scores_of({"c": 300, "r": 400, "k": 500, "equal": 600, "same": 620, "other": 1})
-    third = (1 / 3, 1 / 3, 1 / 3)
-    weights = {"c": (1.0, 0.0, 0.0), "r": (0.0, 1.0, 0.0), "k": (0.0, 0.0, 1.0), "equal": third, "same": third, "late": third}
-    picture, text = draw_weights(scores, tmp_path / "new", weights, reps=REPS)
-    assert is_drawn(picture)
-    assert "| r | 0 | 1 | 0 | 402 (4" in text.read_text() and "- late: no final score" in text.read_text()
-    assert "other" not in text.read_text()
-    with pytest.raises(ValueError, match="weights of c are no shares of 1"):
-        draw_weights(scores, tmp_path, {"c": (1.0, 1.0, 0.0)})
-    with pytest.raises(ValueError, match="no triangle"):
-        draw_weights(scores, tmp_path, {"late": third})

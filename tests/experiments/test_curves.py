@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
+from tests.experiments.test_report import make_run
 
 
 def write_run(folder: Path, returns: dict[int, list[float]]) -> Path:
@@ -46,6 +47,19 @@ def test_methods_side_by_side(tmp_path: Path, drawn: list[matplotlib.figure.Figu
         list(line.get_ydata()) for line in axes.lines if line.get_linewidth() < 1 and not line.get_label().startswith("random")
     ]
     assert thin == [[150, 300], [50], [20]]
+
+
+def test_a_run_knows_its_action_repeat(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:
+    runs = [make_run(tmp_path / "a", "crc"), make_run(tmp_path / "b", "rad", env_kwargs={"action_repeat": 4})]
+    command = ["curve", "--output", str(tmp_path / "curve.png")]
+    assert CliRunner().invoke(app, [*command, str(runs[0])]).exit_code == 0
+    (axes,) = drawn[0].axes
+    assert axes.get_xlabel() == "environment steps (8 per agent step)" and axes.lines[0].get_xdata()[-1] == 100_000
+    done = CliRunner().invoke(app, [*command, *map(str, runs)])
+    assert done.exit_code == 2 and "an agent step is 4 or 8 environment steps" in done.stderr
+    (runs[0] / "evaluations.npz").write_bytes(b"PK\3\4 half")
+    done = CliRunner().invoke(app, [*command, str(runs[0])])
+    assert done.exit_code == 2 and "evaluations.npz cannot be read" in done.stderr
 
 
 def test_one_run_shows_its_episodes_range(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:

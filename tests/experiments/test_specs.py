@@ -7,7 +7,7 @@ import yaml
 
 from sb3_crc import PRESETS
 from sb3_crc.configurations import CONFIGS
-from sb3_crc.experiments.specs import compared, convex_weights, read_sweep
+from sb3_crc.experiments.specs import compared, read_sweep
 from sb3_crc.objectives import objective_weights
 
 LAPTOP = CONFIGS / "laptop.yml"
@@ -90,6 +90,8 @@ def test_a_sweep_reaches_into_settings(file: Path) -> None:
         ("tasks: [cartpole-swingup]", "task: cartpole-swingup", "key"),
         ("seeds: [3, 5]", "", "has no seeds"),
         ("env_kwargs.render_quality: fast", "learning_starts: 2000", "nothing would be learned"),
+        ("seeds: [3, 5]", "seeds: [-1]", "seed=-1 must be at least 0"),
+        ("tasks: [cartpole-swingup]", "tasks: [cartpole-swngup]", "Did you mean 'cartpole-swingup'"),
     ],
 )
 def test_mistakes_are_named_before_anything_runs(file: Path, old: str, new: str, message: str) -> None:
@@ -97,6 +99,35 @@ def test_mistakes_are_named_before_anything_runs(file: Path, old: str, new: str,
     file.write_text(SWEEP.replace(old, new))
     with pytest.raises(ValueError, match=message):
         read_sweep(file)
+
+
+@pytest.mark.parametrize("conf_file", [None, LAPTOP, Path("nowhere.yml")])
+def test_an_unknown_task_is_refused_before_all_else(conf_file: Path | None) -> None:
+    """Also where the configuration names an action repeat, so that the task's own is not asked for, or cannot be read."""
+    with pytest.raises(ValueError, match=r"Unknown task 'walker-wlk'.*only stand, walk, run\. Did you mean 'walker-walk'"):
+        compared(["crc"], ["cartpole-swingup", "walker-wlk"], [0], env_steps=8_000, conf_file=conf_file)
+    with pytest.raises(ValueError, match="there is no domain 'pole'; the domains are acrobot"):
+        compared(["crc"], ["pole-swingup"], [0], env_steps=8_000, conf_file=conf_file)
+
+
+def test_a_task_may_be_named_by_its_id() -> None:
+    by_id, by_name = (
+        compared(["crc"], [task], [0], env_steps=8_000, conf_file=LAPTOP)
+        for task in ("dmc_pixels/walker-walk-v0", "walker-walk")
+    )
+    assert by_id == by_name
+    with pytest.raises(ValueError, match="tasks: 'walker-walk' is there twice"):
+        compared(["crc"], ["walker-walk", "dmc_pixels/walker-walk-v0"], [0], env_steps=8_000, conf_file=LAPTOP)
+
+
+def test_by_default_there_are_twenty_evaluations_at_whole_agent_steps(file: Path) -> None:
+    specs = compared(["rad"], ["cartpole-swingup", "walker-walk"], [0], env_steps=10_000, conf_file=LAPTOP)
+    assert [spec.eval_every for spec in specs] == [496, 500]  # 62 decisions of 8 steps, 250 of 2
+    file.write_text(
+        SWEEP.replace("eval_every: 8000", "").replace("env_kwargs.render_quality: fast", "env_kwargs.action_repeat: 5")
+    )
+    assert {spec.method: spec.eval_every for spec in read_sweep(file)} == {"rad": 800, "half": 800}
+    assert {spec.eval_every for spec in read_sweep(file, env_steps=8_040)} == {400}
 
 
 @pytest.mark.parametrize(
@@ -137,14 +168,6 @@ def test_the_ablations_of_the_paper() -> None:
         (everything,) = (spec for spec in first if spec.method == "all-three" and spec.seed == 0)
         (crc,) = compared(["crc"], ["cartpole-swingup"], [0], env_steps=100_000, eval_every=5_000, conf_file=configuration)
         assert everything.settings == crc.settings
-
-
-def test_the_convex_weights_of_the_second_ablation() -> None:
-    weights = convex_weights(CONFIGS / "sweeps" / "ablation_2.yml")
-    assert len(weights) == 10
-    for name, shares in weights.items():
-        assert sum(shares) == pytest.approx(1)
-        assert [round(100 * share) for share in shares] == pytest.approx([int(part) for part in name.split("-")], abs=1)
 
 
 def test_the_generalisation_ablation_of_the_paper() -> None:

@@ -29,16 +29,15 @@ def evaluate(
     again: Annotated[bool, typer.Option("--again", help="Evaluate also what has been evaluated.")] = False,
 ) -> object:
     """Score final policies: mean action, fresh episodes, seeds that no training and no other evaluation has seen."""
-    from sb3_crc.experiments.runs import FINAL, find_runs, read_json
+    from sb3_crc.experiments.runs import find_runs
 
     found = list(find_runs(runs))
     if not found:
         raise FileNotFoundError(f"no run of train.py in {', '.join(map(str, runs))}")
     scored: list[dict[str, Any]] = []
     for number, run in enumerate(found, 1):
-        if (run.folder / FINAL).exists() and not again:
-            final = read_json(run.folder / FINAL)
-        else:
+        final = None if again else run.final
+        if final is None:
             from sb3_crc.experiments.final import evaluate_final
 
             tell(f"[{number}/{len(found)}] {run.folder}: {episodes} episodes")
@@ -97,16 +96,17 @@ def curves(
     allow_mixed: Mixed = False,
 ) -> object:
     """Curves with intervals over environment steps and wall time, profiles, and which differences are resolved."""
-    from sb3_crc.experiments.comparison_figures import draw_comparison, draw_weights
+    from sb3_crc.experiments.comparison_figures import draw_comparison
+    from sb3_crc.experiments.convex_weights import convex_weights, draw_weights
     from sb3_crc.experiments.scores import read_scores
-    from sb3_crc.experiments.specs import convex_weights
 
     if importlib.util.find_spec("rliable") is None:
         raise ValueError("curves needs the extra 'analysis': pip install 'sb3-crc[analysis]'")
+    shares = None if weights is None else convex_weights(weights)  # before much is read
     scores = read_scores(sources)
     written = draw_comparison(scores, output, baseline=baseline, allow_mixed=allow_mixed)
-    if weights is not None:
-        written += draw_weights(scores, output, convex_weights(weights))
+    if shares is not None:
+        written += draw_weights(scores, output, shares, allow_mixed=allow_mixed)
     for path in written:
         say(str(path))
     for missing in scores.missing:
@@ -114,14 +114,17 @@ def curves(
     return {"written": written, "missing": list(scores.missing)}
 
 
-@command(app, Group.RUNS, "sb3-crc curve logs/crc/dmc_pixels-cartpole-swingup-v0_1 --action-repeat 8")
+@command(app, Group.RUNS, "sb3-crc curve logs/crc/dmc_pixels-cartpole-swingup-v0_1")
 def curve(
     runs: Annotated[
         list[Path],
         typer.Argument(help="Runs of train.py, <method>/<run>, each with evaluations.npz.", autocompletion=completion.runs),
     ],
     output: Annotated[Path, typer.Option(help="Picture to write.")] = Path("learning_curve.png"),
-    action_repeat: Annotated[int, typer.Option(min=1, help="Environment steps per agent step of these runs.")] = 1,
+    action_repeat: Annotated[
+        int | None,
+        typer.Option(min=1, help="Environment steps per agent step; else the runs' own, 1 where there is no args.yml."),
+    ] = None,
     baselines: Annotated[
         Path | None, typer.Option(help="JSON file of `sb3-crc baselines`, whose returns are drawn as lines.")
     ] = None,
@@ -133,7 +136,8 @@ def curve(
 
     measured = {} if baselines is None else read_json(baselines)
     references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
-    shared: dict[str, Any] = {"action_repeat": action_repeat, "title": title, "references": references}
+    repeat = _common_repeat(runs) if action_repeat is None else action_repeat
+    shared: dict[str, Any] = {"action_repeat": repeat, "title": title, "references": references}
     files = [run / "evaluations.npz" for run in runs]
     if len(files) == 1:
         plot_learning_curve(files[0], output, **shared)
@@ -144,6 +148,17 @@ def curve(
         plot_learning_curves(methods, output, **shared)
     say(str(output))
     return {"written": [output]}
+
+
+def _common_repeat(runs: list[Path]) -> int:
+    from sb3_crc.experiments.runs import Run
+
+    repeats = {Run(run).action_repeat if any(run.glob("*/args.yml")) else 1 for run in runs}
+    if len(repeats) > 1:
+        raise ValueError(
+            f"these runs do not share an axis: an agent step is {' or '.join(map(str, sorted(repeats)))} environment steps"
+        )
+    return repeats.pop()
 
 
 @command(app, Group.RUNS, "sb3-crc report runs -o report.html")

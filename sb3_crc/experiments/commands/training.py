@@ -88,7 +88,7 @@ def compare(
         task,
         range(first_seed, first_seed + seeds),
         env_steps=env_steps,
-        eval_every=max(1, env_steps // 20) if eval_every is None else eval_every,
+        eval_every=eval_every,
         eval_episodes=eval_episodes,
         conf_file=conf_file,
     )
