@@ -1,67 +1,76 @@
-"""What a policy that has learned nothing gets: the floor under every learning curve."""
+"""What policies that have learned nothing get, random actions and none: the floor under every learning curve.
 
-from dataclasses import asdict, dataclass
+``sb3-crc baselines`` measures one task, for its curve; ``sb3-crc landmarks`` several, on the episodes of final scores. Nothing
+is drawn, since neither policy looks.
+"""
+
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
 
 from sb3_crc.envs.dmc import make_dmc
+from sb3_crc.envs.tasks import split_task
+from sb3_crc.experiments.final import EPISODES, FIRST_SEED
+from sb3_crc.experiments.provenance import provenance
 
+Policy = Callable[[gym.Env[Any, Any]], np.ndarray]
 
-@dataclass(frozen=True)
-class Baseline:
-    """
-    Returns of one policy without learning.
-
-    :param mean: over the episodes
-    :param std: over the episodes, with n - 1
-    :param returns: of each episode
-    """
-
-    mean: float
-    std: float
-    returns: tuple[float, ...]
-
-
-class _Untrained:
-    """Uniformly random actions, or always the middle of the action space."""
-
-    def __init__(self, action_space: gym.spaces.Box, random: bool):
-        self.action_space = action_space
-        self.random = random
-
-    def predict(self, observations: np.ndarray, *_: Any, **__: Any) -> tuple[np.ndarray, None]:
-        middle = (self.action_space.low + self.action_space.high) / 2
-        actions = [self.action_space.sample() if self.random else middle for _ in observations]
-        return np.stack(actions), None
+POLICIES: dict[str, Policy] = {
+    "random": lambda env: np.asarray(env.action_space.sample()),
+    "zero": lambda env: np.zeros(env.action_space.shape or (), np.float32),
+}
 
 
 def measure_baselines(
     task: str, *, episodes: int = 20, action_repeat: int | None = None, seed: int = 0
 ) -> dict[str, dict[str, Any]]:
     """
-    Measure the returns of the random and of the zero policy. Nothing is rendered: neither looks.
-
     :param task: as for :func:`~sb3_crc.make_dmc`
-    :param episodes: of each policy
+    :param episodes: of each policy, at least two
     :param action_repeat: environment steps per action; None: the task's own
     :param seed: of initial states and random actions
-    :return: ``{"random": {mean, std, returns}, "zero": {...}}``
+    :return: ``{"random": {mean, std, returns}, "zero": {...}}``, std over the episodes, with n - 1
+    :raises ValueError: for an unknown task
     """
-    baselines = {}
-    for name in ("random", "zero"):
-        env = Monitor(make_dmc(task, seed=seed, action_repeat=action_repeat, observation="state"))
-        policy = _Untrained(env.action_space, random=name == "random")  # type: ignore[arg-type]
-        returns, _ = evaluate_policy(
-            policy,  # type: ignore[arg-type]
-            env,
-            n_eval_episodes=episodes,
-            return_episode_rewards=True,
-        )
+    return {
+        name: {"mean": float(np.mean(returns)), "std": float(np.std(returns, ddof=1)), "returns": returns}
+        for name, returns in _returns(task, episodes, seed, action_repeat).items()
+    }
+
+
+def measure_landmarks(tasks: Sequence[str], *, episodes: int = EPISODES, seed: int = FIRST_SEED) -> dict[str, Any]:
+    """
+    :param tasks: domain-task
+    :param episodes: of each policy on each task
+    :param seed: of the environment and of the random actions
+    :return: ``returns``: task -> policy -> the return of each episode, and on what they were measured
+    :raises ValueError: for an unknown task, before anything is measured
+    """
+    for task in tasks:
+        split_task(task)
+    returns = {
+        task: {name: [round(value, 3) for value in own] for name, own in _returns(task, episodes, seed).items()}
+        for task in tasks
+    }
+    return {"episodes": episodes, "first_seed": seed, "returns": returns, "measured": provenance()}
+
+
+def _returns(task: str, episodes: int, seed: int, action_repeat: int | None = None) -> dict[str, list[float]]:
+    """:return: policy -> return of each episode"""
+    found = {}
+    for name, policy in POLICIES.items():
+        env = make_dmc(task, seed=seed, action_repeat=action_repeat, observation="state", render_mode=None)
+        found[name] = [_episode(env, policy) for _ in range(episodes)]
         env.close()
-        assert isinstance(returns, list)
-        baselines[name] = asdict(Baseline(float(np.mean(returns)), float(np.std(returns, ddof=1)), tuple(map(float, returns))))
-    return baselines
+    return found
+
+
+def _episode(env: gym.Env[Any, Any], policy: Policy) -> float:
+    env.reset()
+    total, ended = 0.0, False
+    while not ended:
+        _, reward, terminated, truncated, _ = env.step(policy(env))
+        total, ended = total + float(reward), terminated or truncated
+    return total

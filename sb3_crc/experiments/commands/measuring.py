@@ -46,7 +46,7 @@ def landmarks(
 ) -> object:
     """Measure what random actions and no actions get, on the episodes of final scores."""
     from sb3_crc.envs.tasks import PAPER_TASKS
-    from sb3_crc.experiments.landmarks import measure_landmarks
+    from sb3_crc.experiments.baselines import measure_landmarks
     from sb3_crc.experiments.runs import write_json
 
     found = measure_landmarks(task or PAPER_TASKS, episodes=episodes)
@@ -92,7 +92,8 @@ def ladder(
     """Measure what must work before learning from pixels can."""
     if rung not in RUNGS:
         raise typer.BadParameter(f"{rung!r} is none of {', '.join(RUNGS)}", param_hint="RUNG")
-    policy_kwargs = _policy_kwargs(config) if rung in ("probe", "teach", "overfit") else {}
+    policy_kwargs = _policy_kwargs(config, task) if rung in ("probe", "teach", "overfit") else {}
+    encoder_kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
     from sb3_crc.experiments import ladder as rungs
 
     if rung == "state":
@@ -106,9 +107,9 @@ def ladder(
             for steps in n_steps or [1]
         ]
     elif rung == "probe":
-        measured = rungs.probe_random_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+        measured = rungs.probe_random_encoder(task, encoder_kwargs, seed=seed)
     elif rung == "teach":
-        measured = rungs.teach_encoder(task, policy_kwargs["features_extractor_kwargs"], seed=seed)
+        measured = rungs.teach_encoder(task, encoder_kwargs, seed=seed)
     else:
         measured = [
             rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed)
@@ -120,13 +121,14 @@ def ladder(
     return measured
 
 
-def _policy_kwargs(config: Path) -> dict[str, Any]:
-    import yaml
+def _policy_kwargs(config: Path, task: str) -> Mapping[str, Any]:
+    from sb3_crc.configurations import read_settings
+    from sb3_crc.envs.tasks import environment_id
 
-    try:
-        return dict(yaml.safe_load(config.read_text(encoding="utf-8"))["default"]["policy_kwargs"])
-    except (yaml.YAMLError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{config} has no policy_kwargs under default: {error}") from None
+    found = read_settings(config, "crc", environment_id(task)).get("policy_kwargs")
+    if not isinstance(found, Mapping):
+        raise ValueError(f"{config} has no policy_kwargs for {task}")
+    return found
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
