@@ -34,7 +34,7 @@ def read_settings(file: Path, algorithm: str, env_id: str) -> dict[str, Any]:
     """
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} is no YAML file: {error}") from error
     if not isinstance(content, Mapping):
         raise ValueError(f"{file} is no configuration: it must be a mapping from environments, or 'default', to settings")

@@ -104,13 +104,14 @@ def test_every_algorithm_has_a_file() -> None:
         (ENV, "just text", "own.yml is no configuration: it must be a mapping"),
         (ENV, "a: [", "own.yml is no YAML file"),
         (ENV, "!!python/object/apply:os.getcwd []", "own.yml is no YAML file"),
+        (ENV, "a: caf\udce9", "own.yml is no YAML file"),
         (ENV, "Pendulum-v1: {}", f"own.yml has settings neither for '{ENV}' nor for 'default', only for 'Pendulum-v1'"),
         ("broken", FILE, "own.yml: 'broken' must be a mapping of settings; it is 7"),
         ("typo", FILE, "own.yml, 'typo': unknown preset 'carl'"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(file: Path, env_id: str, content: str, message: str) -> None:
-    file.write_text(content)
+    file.write_text(content, encoding="utf-8", errors="surrogateescape")
     with pytest.raises(ValueError, match=message):
         read_settings(file, "crc", env_id)
 

@@ -14,7 +14,7 @@ from sb3_crc.console import errors, on_a_screen, tell
 from sb3_crc.envs.rendering import probe
 from sb3_crc.experiments.engines.execution import finished
 from sb3_crc.experiments.engines.local import run_locally, threads_each, usable_cores
-from sb3_crc.experiments.needs import RENDERERS, Needs, check_disk, measure_needs, most_at_once
+from sb3_crc.experiments.needs import RENDERERS, Needs, check_disk, measure_needs, most_at_once, nearest_existing
 from sb3_crc.experiments.plans import Plan
 from sb3_crc.experiments.runs import find_runs
 from sb3_crc.experiments.specs import RunSpec
@@ -72,6 +72,8 @@ class Campaign:
             raise ValueError(f"--gpus {self.gpus}: Slurm gives whole GPUs")
         if self.pack and not th.cuda.is_available():
             raise ValueError("--pack fills a GPU, and there is none that torch can use; `python -m sb3_crc doctor` shows more")
+        if not isinstance(minutes := self.slurm.get("timeout_min", 1), int) or minutes < 1:
+            raise ValueError(f"--slurm timeout_min={minutes} must be a whole number of minutes, at least 1")
 
     @property
     def measures(self) -> bool:
@@ -101,7 +103,7 @@ def check_folder(root: Path) -> None:
     :param root: where runs will be written; it need not exist
     :raises ValueError: if nothing can be written there
     """
-    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    existing = nearest_existing(root)
     try:
         if not existing.is_dir():
             raise NotADirectoryError(f"{existing} is a file")
@@ -164,7 +166,7 @@ def _engine(how: Campaign, jobs: int, needs: Mapping[str, Needs]) -> Callable[..
         parameters = dict(how.slurm)
         options = SlurmOptions(
             cluster=str(parameters.pop("cluster", "slurm")),
-            minutes=int(parameters.pop("timeout_min", SlurmOptions.minutes)),
+            minutes=parameters.pop("timeout_min", SlurmOptions.minutes),
             cpus=how.cpus or 1,
             gpus=round(how.gpus or 0),
             memory=memory,

@@ -135,13 +135,18 @@ def check_disk(needs: Sequence[Needs], root: Path) -> None:
     :param root: folder of the comparison, which need not exist yet
     :raises ValueError: if what they write will not fit
     """
-    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    existing = nearest_existing(root)
     needed, free = sum(one.disk for one in needs), shutil.disk_usage(existing).free
     if needed > free:
         raise ValueError(
             f"the runs will write about {needed / GIGABYTE:.1f} GB, and {free / GIGABYTE:.1f} GB are free in {existing}: "
             "make room, or choose another --output"
         )
+
+
+def nearest_existing(path: Path) -> Path:
+    """:return: the path itself, or the nearest above it that exists"""
+    return next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
 
 
 def measure(spec: RunSpec) -> Needs:

@@ -1,4 +1,4 @@
-"""Cartpole's state as an encoder could deliver it: positions with an error, and nothing once the cart has left the picture.
+"""Cartpole's state as an encoder could deliver it: positions with an error; once the cart has left the picture, only its side.
 
 K frames.
 """
@@ -17,7 +17,7 @@ class SeenPositions(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
     """
     :param env: ``make_dmc("cartpole-...", observation="state")``, whose observation begins with x, cos and sin of the angle
     :param error: standard deviation of what is read off each frame, in metres of cart and pole tip (the pole is 1 m long)
-    :param frames: K, whose newest is given as it is, and of whose neighbours the differences; velocities are not given
+    :param frames: K, of which the newest is given, and the differences between neighbours; velocities are not given
     :param seed: of the errors
     :raises ValueError: if the observation is not one of cartpole, or ``error`` or ``frames`` is out of range
     """
@@ -41,7 +41,8 @@ class SeenPositions(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """
         :param observation: ``(5,)``
-        :return: ``(4 K,)``: x, cos, sin, 1 of the newest frame, then four times the differences; but x zero out of the picture
+        :return: ``(4 K,)``: x, cos, sin and 1 of the newest frame, then four times the differences. Out of the picture, x is
+            that of its edge and the others are 0
         """
         position, cosine, sine = (float(value) for value in observation[:3])
         angle = np.arctan2(sine, cosine) + self.error * self._rng.normal()

@@ -51,6 +51,7 @@ def collector() -> tuple[Events, Callable[[RunSpec, str, str], None]]:
         (["--engine", "ray", "--jobs", "2"], "--jobs is an option of --engine local and slurm"),
         (["--engine", "slurm", "--gpus", "0.5"], "Slurm gives whole GPUs"),
         (["--engine", "slurm", "--slurm", "partition"], "--slurm 'partition' must be NAME=VALUE"),
+        (["--engine", "slurm", "--slurm", "timeout_min=4h"], "--slurm timeout_min=4h must be a whole number of minutes"),
         (["--engine", "slurm", "--memory", "1"], "sbatch is not in PATH"),
         (["--engine", "slurm", "--memory", "1", "--slurm", "cluster=local", "--slurm", "colour=red"], "colour"),
         (["--engine", "ray", "--address", "nowhere", "--memory", "1"], "'nowhere' is no address"),

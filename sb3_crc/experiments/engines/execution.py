@@ -20,11 +20,10 @@ from filelock import FileLock, Timeout
 
 from sb3_crc.envs.rendering import FIRST_FRAME, NO_FRAME
 from sb3_crc.envs.tasks import environment_id
-from sb3_crc.experiments.runs import FAILURE, FINAL, SPEC, read_json, write_json
+from sb3_crc.experiments.runs import CHECKPOINTS, DONE, FAILURE, FINAL, SPEC, read_json, write_json
 from sb3_crc.experiments.specs import RunSpec
 
-LOG, SETTINGS, LOCK = "log.txt", "settings.yml", "lock"
-CHECKPOINTS, FLAGS, DONE = "checkpoints", "flags.json", "DONE"
+LOG, SETTINGS, LOCK, FLAGS = "log.txt", "settings.yml", "lock", "flags.json"
 #: Seconds in which a training that was told to stop saves a checkpoint
 PATIENCE = 60.0
 #: Seconds in which a back end that was chosen for a run must draw
@@ -32,7 +31,7 @@ FIRST_FRAME_WITHIN = 60.0
 #: prctl(2)
 PR_SET_PDEATHSIG = 1
 
-#: What happened to a run: begun, resumed, finished, failed or skipped, and a remark
+#: What happened to a run (begun, resumed, restarted, finished, failed, skipped; on a cluster submitted or found), and a remark
 Report = Callable[[RunSpec, str, str], None]
 
 
@@ -262,11 +261,8 @@ def _wait_until_left(lock: Path) -> None:
         own.release()
 
 
-def _libc() -> Any:
-    return ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
-
-
-_LIBC = _libc()
+#: Loaded now, since between fork and exec no library may be
+_LIBC: Any = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 def _end_with_parent() -> None:
