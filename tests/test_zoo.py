@@ -10,6 +10,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import rl_zoo3
@@ -17,6 +18,7 @@ import yaml
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_crc import CRCSAC, PRESETS, QBiasEvalCallback
+from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.zoo import CRCExperimentManager, preset_class, register
 from sb3_crc.zoo.resume import Plan
 from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
@@ -164,6 +166,7 @@ def test_without_a_loadable_best_model_the_final_one_is_filmed(
 
     monkeypatch.setattr("sb3_crc.zoo.manager.film", film)
     model = make_model()
+    model.env.render_mode = "rgb_array"
     manager._film(model, model.env)
     assert filmed == [model]
     assert (folder / "policy.mp4").read_bytes() == b"film"
@@ -183,9 +186,35 @@ def test_an_interrupted_film_leaves_the_one_before(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr("sb3_crc.zoo.manager.film", film)
     model = make_model()
+    model.env.render_mode = "rgb_array"
     with pytest.raises(KeyboardInterrupt):
         manager._film(model, model.env)
     assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [("policy.mp4", b"film")]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (None, "env_kwargs need render_mode: rgb_array"),
+        (RenderingUnavailable("nothing draws"), "no policy.mp4: nothing draws"),
+        (gym.error.DependencyNotInstalled("pygame is not installed"), "no policy.mp4: pygame is not installed"),
+    ],
+)
+def test_without_pictures_there_is_no_film(
+    error: Exception | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    manager = CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0)
+    model = make_model()
+
+    def render(mode: str) -> None:
+        assert error is not None
+        raise error
+
+    if error is not None:
+        model.env.render_mode = "rgb_array"
+        monkeypatch.setattr(model.env, "render", render)
+    manager._film(model, model.env)
+    assert said in caplog.text and not list(tmp_path.rglob("*.mp4"))
 
 
 @pytest.mark.parametrize("checkpoints", [True, False])
@@ -217,6 +246,7 @@ def test_a_film_that_does_not_fit_costs_no_more_than_the_film(
     manager.n_timesteps, manager.normalize = 0, False
     Path(manager.save_path).mkdir(parents=True)
     model = make_model()
+    model.env.render_mode = "rgb_array"
     monkeypatch.setattr(sys, "orig_argv", ["python", "train.py"])
     monkeypatch.setattr(manager, "create_envs", lambda *args, **kwargs: model.env)
 

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import optuna
 import rl_zoo3.hyperparams_opt
 import yaml
@@ -27,6 +28,7 @@ from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.configurations import configuration_file, settings_for
 from sb3_crc.disk import is_of_disk
+from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.experiments.provenance import provenance
@@ -170,6 +172,9 @@ class CRCExperimentManager(ExperimentManager):
         if importlib.util.find_spec("av") is None:
             logger.warning("no policy.mp4: install the extra 'video' (pip install 'sb3-crc[video]')")
             return
+        if environment.render_mode != "rgb_array":  # rl_zoo3 asks no environment for it; ours have it anyway
+            logger.warning("no policy.mp4: for one, the configuration's env_kwargs need render_mode: rgb_array")
+            return
         policy, best = model, Path(self.save_path) / "best_model.zip"
         try:
             if best.exists():
@@ -180,6 +185,8 @@ class CRCExperimentManager(ExperimentManager):
         try:
             film(policy, environment, unfinished)
             os.replace(unfinished, best.with_name("policy.mp4"))
+        except (RenderingUnavailable, gym.error.Error) as error:  # the latter: a renderer is not installed
+            logger.warning("no policy.mp4: %s", error)
         finally:
             unfinished.unlink(missing_ok=True)
 
