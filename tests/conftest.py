@@ -72,6 +72,11 @@ class ClockEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._frame(), 1.0, end and self.terminates, end, {}
 
 
+def construct(env: gym.Env[Any, Any] | None = None, **settings: Any) -> CRCSAC:
+    """A tiny CRCSAC that has seen nothing yet."""
+    return CRCSAC("CnnPolicy", env or NoiseEnv(), **{"buffer_size": 50, "policy_kwargs": POLICY_KWARGS, **settings})
+
+
 def make_model(env: gym.Env[Any, Any] | None = None, **kwargs: Any) -> CRCSAC:
     """A tiny CRCSAC, seeded, with 40 transitions of random frames in its buffer and nothing learned yet."""
     settings: dict[str, Any] = {
@@ -109,6 +114,12 @@ def repeatable() -> None:
     th.set_num_threads(1)
     th.manual_seed(0)
     np.random.seed(0)
+
+
+@pytest.fixture(scope="module")
+def observations() -> np.ndarray:
+    """Five stacks of random frames, as :class:`NoiseEnv` has them."""
+    return np.random.default_rng(0).integers(0, 256, (5, 9, 40, 40), dtype=np.uint8)
 
 
 @pytest.fixture
