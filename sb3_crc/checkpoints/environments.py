@@ -19,8 +19,8 @@ NEXT_RESET = ("_seeds", "_options")
 def vec_env_state(env: VecEnv) -> Tree:
     """
     :param env: environments, whatever they are wrapped in
-    :return: what their future depends on. Of environments without ``get_state`` only wrappers are held: these go on at their
-        next reset, which is not exact, and :func:`set_vec_env_state` says so
+    :return: what their future depends on. Of environments without ``get_state`` only the wrappers' state is held: they go on
+        at their next reset, which is not exact, and :func:`set_vec_env_state` says so
     """
     wrappers = []
     while isinstance(env, VecEnvWrapper):
@@ -40,7 +40,7 @@ def set_vec_env_state(env: VecEnv, state: Tree) -> bool:
     """
     :param env: made as the one that was saved, and reset
     :param state: of :func:`vec_env_state`
-    :return: whether it goes on exactly where it was; False: at the next reset, as after the one that ``env`` has just had
+    :return: whether it goes on exactly where it was; False: it must be reset before its next step
     :raises ValueError: if the environments are others
     """
     for attributes in state["wrappers"]:

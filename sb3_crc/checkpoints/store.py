@@ -15,11 +15,9 @@ import os
 import shutil
 import uuid
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -118,13 +116,14 @@ class CheckpointStore:
             os.replace(target, self.folder / f"{UNFINISHED}{uuid.uuid4().hex[:12]}")
         os.replace(unfinished, target)
         sync(self.folder)
-        self._prune()
+        self._prune(target.name)
         return target
 
     def newest(self) -> Checkpoint | None:
         """
         Find the newest checkpoint that is undamaged; each damaged one is warned of.
 
+        :return: None: there are no checkpoints
         :raises CheckpointError: if there are only damaged ones, or one of a later format
         """
         names = self.names()
@@ -161,22 +160,23 @@ class CheckpointStore:
             self._checksums[segment] = checksum(self.segments / segment)
         return self._checksums[segment]
 
-    def _prune(self) -> None:
-        kept, superfluous = self.names()[: self.keep], self.names()[self.keep :]
-        needed = {name for checkpoint in kept for name in self._needed(checkpoint)}
-        for name in superfluous:
+    def _prune(self, newest: str) -> None:
+        names = self.names()
+        kept = [name for name in names if name <= newest][: self.keep]  # training went on from before any later, damaged one
+        needed = {segment for name in kept for segment in self._needed(name)}
+        for name in set(names) - set(kept):
             shutil.rmtree(self.folder / name)
         self.remove_unfinished()
         for path in self.segments.iterdir():
             if path.name not in needed:
                 path.unlink()
 
-    def _needed(self, name: str) -> Iterator[str]:
+    def _needed(self, name: str) -> set[str]:
+        """:return: segments of a checkpoint; a damaged one needs nothing any more"""
         try:
-            manifest: dict[str, Any] = json.loads((self.folder / name / MANIFEST).read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # damaged: it needs nothing any more
-            return
-        yield from manifest["segments"]
+            return set(json.loads((self.folder / name / MANIFEST).read_text(encoding="utf-8"))["segments"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return set()
 
 
 def checksum(path: Path) -> str:

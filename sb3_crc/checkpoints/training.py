@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from inspect import signature
-from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
@@ -12,7 +11,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_crc.checkpoints.environments import set_vec_env_state, vec_env_state
 from sb3_crc.checkpoints.logs import log_state, set_log_state
-from sb3_crc.checkpoints.tree import Tree, copied, is_plain, random_states, set_random_states
+from sb3_crc.checkpoints.tree import Tree, copied, in_type_of, is_plain, random_states, set_random_states
 
 #: Counters, the last observation, and the episodes that the log's means are over. ``_total_timesteps`` is not among them: it
 #: is what ``learn`` was called with
@@ -68,21 +67,17 @@ def set_training_state(model: OffPolicyAlgorithm, callback: BaseCallback, state:
     :raises ValueError: if anything does not fit, naming it; the model is then not to be used
     """
     assert model.env is not None
-    start = model._last_obs, model._last_original_obs
-    for name, value in state["networks"].items():
-        _load(name, recursive_getattr(model, name), copied(value))
-    if hasattr(model, "forget_recordings"):
-        model.forget_recordings()
-    for name, value in state["variables"].items():
-        recursive_getattr(model, name).data.copy_(value)
+    _set_networks(model, state)
     for name, value in state["counters"].items():
         setattr(model, name, copied(value))
     if state["collapse_alarm"] is not None:
         model._collapse_alarm._updates = state["collapse_alarm"]  # type: ignore[attr-defined]
     _set_noise_state(model.action_noise, state["action_noise"])
     model.action_space.np_random.bit_generator.state = state["action_space"]
-    if not set_vec_env_state(model.env, state["environment"]):  # they stand at the start of an episode
-        model._last_obs, model._last_original_obs = start
+    if not set_vec_env_state(model.env, state["environment"]):
+        model._last_obs = model.env.reset()  # type: ignore[assignment]  # also of wrappers, which had been in an episode
+        if model._vec_normalize_env is not None:
+            model._last_original_obs = model._vec_normalize_env.get_original_obs()
         model._last_episode_starts = np.ones(model.env.num_envs, dtype=bool)
     set_log_state(model.logger, model.env, state["log"])
     callbacks = list(callback_tree(callback))
@@ -131,7 +126,8 @@ def callback_state(callback: BaseCallback) -> Tree:
 
 def set_callback_state(callback: BaseCallback, state: Tree) -> None:
     """:param callback: of the same class; :param state: of :func:`callback_state`"""
-    vars(callback).update(copied(state["attributes"]))
+    for name, value in copied(state["attributes"]).items():
+        setattr(callback, name, in_type_of(getattr(callback, name, None), value))
     if isinstance(callback, EvalCallback):
         callback.eval_env.reset()
         set_vec_env_state(callback.eval_env, state["environment"])
@@ -139,11 +135,19 @@ def set_callback_state(callback: BaseCallback, state: Tree) -> None:
         callback.set_training_state(copied(state["own"]))  # type: ignore[attr-defined]
 
 
-def _load(name: str, target: Any, value: Tree) -> None:
-    try:
-        target.load_state_dict(value)
-    except (RuntimeError, ValueError, KeyError) as error:
-        raise ValueError(f"{name} is not the one that was saved: {error}") from error
+def _set_networks(model: OffPolicyAlgorithm, state: Tree) -> None:
+    for kind, own in zip(("networks", "variables"), model._get_torch_save_params(), strict=True):
+        if differing := sorted(set(own) ^ state[kind].keys()):
+            raise ValueError(f"{', '.join(differing)}: there is none in the saved training, or none in this one")
+    for name, value in state["networks"].items():
+        try:
+            recursive_getattr(model, name).load_state_dict(copied(value))
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise ValueError(f"{name} is not the one that was saved: {error}") from error
+    if hasattr(model, "forget_recordings"):
+        model.forget_recordings()
+    for name, value in state["variables"].items():
+        recursive_getattr(model, name).data.copy_(value)
 
 
 def _noise_state(noise: ActionNoise | None) -> Tree:
@@ -153,6 +157,8 @@ def _noise_state(noise: ActionNoise | None) -> Tree:
 
 
 def _set_noise_state(noise: ActionNoise | None, state: Tree) -> None:
+    if (noise is None, isinstance(noise, VectorizedActionNoise)) != (state is None, isinstance(state, list)):
+        raise ValueError(f"the action noise {noise} is not of the kind that was saved")
     if isinstance(noise, VectorizedActionNoise):
         for one, own in zip(noise.noises, state, strict=True):
             _set_noise_state(one, own)

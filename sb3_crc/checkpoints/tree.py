@@ -1,5 +1,6 @@
 """Trees of plain data, and how they become one file of arrays and one of JSON, without pickle."""
 
+import copy
 import json
 import random
 from collections import deque
@@ -25,11 +26,11 @@ def is_plain(value: Any) -> bool:
         return all(isinstance(key, int | str) and is_plain(item) for key, item in value.items())
     if isinstance(value, list | tuple | deque):
         return all(map(is_plain, value))
-    return type(value) in SCALARS or isinstance(value, np.generic | th.Tensor) or _is_array(value)
+    return type(value) in SCALARS or isinstance(value, th.Tensor) or _is_numeric(value)
 
 
-def _is_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+def _is_numeric(value: Any) -> bool:
+    return isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"
 
 
 def write_tree(tree: Tree, folder: Path) -> None:
@@ -55,13 +56,31 @@ def copied(tree: Tree) -> Tree:
     """:return: an equal tree that shares no memory with ``tree``; tensors come to the CPU"""
     if isinstance(tree, Mapping):
         return {key: copied(value) for key, value in tree.items()}
-    if isinstance(tree, list | tuple):
-        return type(tree)(map(copied, tree))
+    if isinstance(tree, list):
+        return [copied(item) for item in tree]
+    if isinstance(tree, tuple):
+        return tuple(map(copied, tree))
     if isinstance(tree, deque):
         return deque(map(copied, tree), tree.maxlen)
     if isinstance(tree, th.Tensor):
         return tree.detach().to("cpu", copy=True)
     return tree.copy() if isinstance(tree, np.ndarray) else tree
+
+
+def in_type_of(example: Any, tree: Tree) -> Any:
+    """
+    Trees know no more types than JSON and a few: what took the place of a subclass becomes one again.
+
+    :param example: what ``tree`` is to replace, a defaultdict for instance, or a named tuple
+    :param tree: of the same kind
+    :return: ``tree`` itself, or its items in the type of ``example``
+    """
+    if isinstance(tree, dict) and isinstance(example, dict) and type(example) is not dict:
+        same = copy.copy(example)
+        same.clear()
+        same.update(tree)
+        return same
+    return example._make(tree) if isinstance(tree, tuple) and hasattr(example, "_make") else tree
 
 
 def _encode(value: Any, arrays: dict[str, th.Tensor], place: str) -> Any:
@@ -79,16 +98,15 @@ def _encode(value: Any, arrays: dict[str, th.Tensor], place: str) -> Any:
         return {"kind": "deque" if isinstance(value, deque) else "tuple", "items": items, **maxlen}
     if isinstance(value, th.Tensor):
         kind, tensor = "tensor", value.detach().cpu()
-    elif isinstance(value, np.generic) and value.dtype.kind in "biuf":
-        kind, tensor = "scalar", th.from_numpy(np.array(value))
-    elif _is_array(value):
-        kind, tensor = "array", th.from_numpy(np.ascontiguousarray(value))
+    elif _is_numeric(value):
+        kind, tensor = "scalar" if isinstance(value, np.generic) else "array", th.from_numpy(np.array(value, order="C"))
     else:
         raise TypeError(f"{place} is {type(value).__name__}, which is no plain data")
-    arrays[place] = tensor.clone().contiguous()
+    name = place if place not in arrays else f"{place} {len(arrays)}"  # a key may hold a slash, or be 3 beside "3"
+    arrays[name] = tensor.clone().contiguous()
     # Little matters where memory is laid out otherwise, but sums over it would round otherwise
     layout = {"layout": "channels_last"} if _is_channels_last(tensor) else {}
-    return {"kind": kind, "name": place, **layout}
+    return {"kind": kind, "name": name, **layout}
 
 
 def _is_channels_last(tensor: th.Tensor) -> bool:

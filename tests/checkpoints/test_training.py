@@ -1,10 +1,10 @@
 """A training state, taken in one run and set in another, makes the other go on as the first did."""
 
 import copy
-from collections import deque
+from collections import defaultdict, deque
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,13 +14,14 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crc import CRCSAC, make_dmc
 from sb3_crc.checkpoints.environments import set_vec_env_state, vec_env_state
-from sb3_crc.checkpoints.training import set_training_state, training_state
+from sb3_crc.checkpoints.training import callback_state, set_callback_state, set_training_state, training_state
 from sb3_crc.checkpoints.tree import copied, is_plain, read_tree, write_tree
-from tests.conftest import POLICY_KWARGS, NoiseEnv
+from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 STEPS, MIDDLE = 60, 35
 
@@ -148,6 +149,9 @@ def test_trees_survive_files(tmp_path: Path) -> None:
         "empty": np.empty((0, 3), np.uint32),
         "tensor": th.arange(24.0).view(1, 2, 3, 4).contiguous(memory_format=th.channels_last),
         "large": 2**100,
+        "no dimension": np.array(2.5),
+        "a/b": np.zeros(2),
+        "a": {"b": np.ones(2), 3: np.ones(3), "3": np.zeros(3)},
     }
     assert is_plain(tree)
     write_tree(tree, tmp_path)
@@ -159,7 +163,7 @@ def test_trees_survive_files(tmp_path: Path) -> None:
 
 
 def test_what_is_no_plain_data_is_named(tmp_path: Path) -> None:
-    assert not is_plain({"a": [object()]}) and not is_plain(np.array([None]))
+    assert not is_plain({"a": [object()]}) and not is_plain(np.array([None])) and not is_plain(np.str_("text"))
     with pytest.raises(TypeError, match="/a/1 is object, which is no plain data"):
         write_tree({"a": [1, object()]}, tmp_path)
 
@@ -183,3 +187,51 @@ def test_a_seed_for_the_next_reset_is_part_of_the_state(exact: bool) -> None:
     first = saved.reset()
     assert np.array_equal(other.reset(), first)
     assert not np.array_equal(environment(4).reset(), first)
+
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+
+class Keeping(BaseCallback):
+    """Keeps what plain types are the base of, and what is not plain."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: dict[str, int] = defaultdict(int)
+        self.pair = Pair(0, 0)
+        self.name = np.str_("")
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_attributes_of_callbacks_keep_their_types(tmp_path: Path) -> None:
+    callback, other = Keeping(), Keeping()
+    callback.counts["steps"] += 3
+    callback.pair, callback.name = Pair(1, 2), np.str_("kept by nobody")
+    write_tree(callback_state(callback), tmp_path)
+    set_callback_state(other, read_tree(tmp_path))
+    assert (other.counts, other.pair, other.name) == ({"steps": 3}, Pair(1, 2), "")
+    assert other.counts["updates"] == 0 and other.pair.second == 2
+    other.counts["steps"] += 1
+    assert callback.counts["steps"] == 3
+
+
+NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
+
+
+@pytest.mark.parametrize(
+    ("saved", "own", "message"),
+    [
+        ({}, {"ent_coef": 0.1}, "ent_coef_optimizer: there is none"),
+        ({"ent_coef": 0.1}, {}, "ent_coef_optimizer: there is none"),
+        ({}, {"action_noise": NOISE}, "the action noise .* is not of the kind"),
+        ({"action_noise": NOISE}, {}, "the action noise None is not of the kind"),
+    ],
+)
+def test_what_does_not_fit_is_named(saved: dict[str, Any], own: dict[str, Any], message: str) -> None:
+    state = training_state(make_model(**saved), Keeping())
+    with pytest.raises(ValueError, match=message):
+        set_training_state(make_model(**own), Keeping(), state)
