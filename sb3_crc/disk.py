@@ -9,7 +9,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TextIO
 
-from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat
+from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_crc.atomic import atomic_write
 
@@ -48,53 +48,52 @@ def outlived(what: object) -> Iterator[None]:
 class EnduringFile:
     """
     A text file in place of one of SB3's, whose errors are warnings, one until it can be written again. Nothing that was
-    written is lost: what does not fit is kept, and written with the next line if there is room then.
+    written is lost: all of it is kept in memory, and what is not on the disk is written with the next line if there is room
+    then.
 
     :param file: opened for writing; it is closed, and opened again for as long as something is written
     """
 
     def __init__(self, file: TextIO):
-        self.name = file.name
+        self.name = os.path.abspath(file.name)  # the process may go to another folder
         self._told = False
-        self._pending = ""  # after what is on the disk
-        self._whole: StringIO | None = None  # in place of what is on the disk
         with suppress(OSError):
             file.close()
-        self._size = os.path.getsize(self.name)
+        there = Path(self.name).read_bytes()
+        self._text = StringIO(newline="")
+        self._size, self._length = len(there), self._text.write(there.decode())  # of what is on the disk: bytes, characters
+        self._rewritten = False
 
     def contents(self) -> str:
         """:return: all that was written, on the disk or not"""
-        if self._whole is not None:
-            return self._whole.getvalue()
-        with open(self.name, "rb") as file:
-            return file.read(self._size).decode() + self._pending
+        return self._text.getvalue()
 
     def write(self, text: str) -> int:
         """:param text: to write; :return: its length"""
-        if self._whole is not None:
-            return self._whole.write(text)
-        self._pending += text
-        return len(text)
+        return self._text.write(text)
 
     def seek(self, position: int) -> int:
         """:param position: where what is written next replaces what is there; :return: it"""
-        return self._in_memory().seek(position)
+        self._rewritten = True
+        return self._text.seek(position)
 
     def truncate(self) -> int:
         """:return: the length of what is left, up to the position"""
-        return self._in_memory().truncate()
+        return self._text.truncate()
 
     def readlines(self) -> list[str]:
         """:return: those from the position on"""
-        return self._in_memory().readlines()
+        return self._text.readlines()
 
     def flush(self) -> None:
         """Bring what was written to the disk."""
         try:
-            if self._whole is not None:
-                self._replace(self._whole.getvalue().encode())
-            elif self._pending:
-                self._append(self._pending.encode())
+            if self._rewritten or not os.path.exists(self.name):
+                self._replace(self.contents())
+            else:
+                self._text.seek(self._length)
+                if more := self._text.read():
+                    self._append(more)
             self._told = False
         except OSError as error:
             if not is_of_disk(error):
@@ -107,13 +106,8 @@ class EnduringFile:
         """Write what is left; what does not fit now is lost."""
         self.flush()
 
-    def _in_memory(self) -> StringIO:
-        if self._whole is None:
-            self._whole = StringIO(self.contents(), newline="")
-            self._pending = ""
-        return self._whole
-
-    def _append(self, more: bytes) -> None:
+    def _append(self, text: str) -> None:
+        more = text.encode()
         with open(self.name, "r+b", buffering=0) as file:
             file.seek(self._size)
             try:
@@ -124,16 +118,17 @@ class EnduringFile:
                 file.truncate(self._size)  # no half a line
                 raise
         self._size += len(more)
-        self._pending = ""
+        self._length += len(text)
 
-    def _replace(self, whole: bytes) -> None:
+    def _replace(self, text: str) -> None:
+        whole = text.encode()
         with atomic_write(Path(self.name)) as unfinished:
             unfinished.write_bytes(whole)
-        self._size = len(whole)
-        self._whole = None
+        self._size, self._length = len(whole), len(text)
+        self._rewritten = False
 
 
-class EnduringEvents(KVWriter):
+class EnduringEvents(TensorBoardOutputFormat):  # for callbacks that look for it, as SB3's documentation shows
     """
     TensorBoard's events, whose writer is of no use after an error: from then on each record tries to begin a new file.
 
@@ -141,28 +136,28 @@ class EnduringEvents(KVWriter):
     """
 
     def __init__(self, events: TensorBoardOutputFormat):
-        self._folder = events.writer.log_dir
-        self._events: TensorBoardOutputFormat | None = events
+        self.writer = events.writer
+        self._is_closed = False
         self._told = False
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """:param key_values: to write; :param key_excluded: formats that do without them; :param step: agent steps"""
         try:
-            if self._events is None:
-                self._events = TensorBoardOutputFormat(self._folder)
-            self._events.write(key_values, key_excluded, step)
+            if self._is_closed:
+                super().__init__(self.writer.log_dir)
+            super().write(key_values, key_excluded, step)
             self._told = False
         except OSError as error:
             if not is_of_disk(error):
                 raise
             if not self._told:
-                warn_of(f"TensorBoard's events in {self._folder}", error)
+                warn_of(f"TensorBoard's events in {self.writer.log_dir}", error)
             self._told = True
             self.close()
 
     def close(self) -> None:
         """Close the file; what does not fit then is lost."""
-        if self._events is not None:
+        if not self._is_closed:
             with suppress(OSError):
-                self._events.close()
-            self._events = None
+                self.writer.close()
+        self._is_closed = True

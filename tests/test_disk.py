@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crc import CRCSAC
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
+from sb3_crc.checkpoints.logs import endure
 from sb3_crc.checkpoints.store import CheckpointStore
-from sb3_crc.disk import EnduringFile, outlived
+from sb3_crc.disk import EnduringEvents, EnduringFile, outlived
 from sb3_crc.evaluation import QBiasEvalCallback
 from tests.conftest import POLICY_KWARGS, NoiseEnv
 
@@ -88,6 +89,32 @@ def test_a_file_whose_head_changes_is_replaced_whole(tmp_path: Path, monkeypatch
     file.write("6,7\n")
     file.flush()
     assert path.read_text() == "a,b\n1,\n2,3\n4,5\n6,7\n" and [one.name for one in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_a_file_stays_where_it_is_when_the_process_goes_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("log.csv")
+    file = EnduringFile(path.open("w"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    file.write("a line\n")
+    assert written(file) == [] and (tmp_path / "log.csv").read_text() == "a line\n"
+
+
+def test_streams_of_others_are_left_alone_and_tensorboard_is_found(tmp_path: Path) -> None:
+    """Standard output is not always what it was when the logger was made; callbacks look for TensorBoard's class."""
+    with (tmp_path / "stream").open("w") as stream:
+        logger = Logger(str(tmp_path), [HumanOutputFormat(stream), TensorBoardOutputFormat(str(tmp_path))])
+        for _ in range(2):  # of the same logger, in two trainings
+            endure(logger, DummyVecEnv([NoiseEnv]), None)
+        human, events = logger.output_formats
+        assert isinstance(human, HumanOutputFormat) and human.file is stream and not stream.closed
+        assert isinstance(events, TensorBoardOutputFormat) and isinstance(events, EnduringEvents)
+        events.writer.add_text("told", "by a callback")
+        logger.record("a", 1.0)
+        logger.dump()
+        logger.close()
+    assert len(list(tmp_path.glob("events.out.*"))) == 1 and "a" in (tmp_path / "stream").read_text()
 
 
 def test_errors_that_are_not_the_disks_are_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

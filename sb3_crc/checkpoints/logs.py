@@ -1,6 +1,5 @@
 """Files that SB3 opens anew when a script starts: what a stopped run had written is written again, and then continued."""
 
-import sys
 import time
 from collections.abc import Iterator
 from csv import DictReader, DictWriter
@@ -10,7 +9,13 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium as gym
-from stable_baselines3.common.logger import CSVOutputFormat, JSONOutputFormat, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    HumanOutputFormat,
+    JSONOutputFormat,
+    Logger,
+    TensorBoardOutputFormat,
+)
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
@@ -65,11 +70,12 @@ def endure(logger: Logger, env: VecEnv, folder: Path | None) -> None:
     :param folder: of Monitor's files where the environments live in other processes, see :func:`distant_monitors`
     """
     for place, format_ in enumerate(logger.output_formats):
-        if isinstance(format_, TensorBoardOutputFormat):
+        if isinstance(format_, TensorBoardOutputFormat) and not isinstance(format_, EnduringEvents):
             logger.output_formats[place] = EnduringEvents(format_)
-        file = getattr(format_, "file", None)
-        if isinstance(getattr(file, "name", None), str) and file not in (sys.stdout, sys.stderr):
-            format_.file = _enduring(file)  # type: ignore[attr-defined]
+        elif isinstance(format_, HumanOutputFormat) and not format_.own_file:
+            continue  # a stream, as sys.stdout was when the logger was made
+        elif isinstance(format_, CSVOutputFormat | JSONOutputFormat | HumanOutputFormat):
+            format_.file = _enduring(format_.file)  # type: ignore[assignment]
     for monitor in _monitors(env):
         results = monitor.results_writer
         results.file_handler = _enduring(results.file_handler)
