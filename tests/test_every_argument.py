@@ -345,7 +345,7 @@ TABLES: dict[Callable[..., Any], Table] = {
 OWN_AND_PASSED_ON = {*inspect.signature(CRCSAC).parameters, *inspect.signature(SAC).parameters} - {"kwargs"}
 CHECKPOINT_CHANGES = {"folder": "elsewhere", "every": 6, "keep": 1}
 CHECKPOINT_ELSEWHERE = {
-    "monitor_dir": "tests/checkpoints/test_callback.py::test_environments_in_other_processes_go_on_with_their_files",
+    "monitor_dir": "tests/checkpoints/test_logs.py::test_environments_in_other_processes_go_on_with_their_files",
     "verbose": HERE + "test_verbose_tells_more",
 }
 CASES = [(thing, argument) for thing, table in TABLES.items() for argument in table.changes]

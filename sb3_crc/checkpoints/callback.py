@@ -1,30 +1,27 @@
 """The callback that saves a training and goes on with it."""
 
-import json
-import os
-import socket
-import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import torch as th
-from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.buffers.files import contents, read_contents
+from sb3_crc.checkpoints.lock import RunLock
 from sb3_crc.checkpoints.logs import distant_monitors, endure, set_distant_monitors
 from sb3_crc.checkpoints.signals import StopRequest, TrainingStopped
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
 from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
 from sb3_crc.checkpoints.tree import Tree
-from sb3_crc.disk import outlived
+from sb3_crc.disk import is_of_disk, outlived
 
-LOCK, OWNER, DONE = "lock", "owner.json", "DONE"
+#: File in the folder of a training that has ended
+DONE = "DONE"
 
 
 class TrainingCheckpoint(BaseCallback):
@@ -33,10 +30,13 @@ class TrainingCheckpoint(BaseCallback):
     and it ends as it would have without the interruption, bit for bit on a CPU with the same number of threads.
 
     Checkpoints are taken where a rollout starts, the only point at which environments, replay buffer, counters and networks
-    agree, and at the end; they are written beside the training. The file DONE tells that the training has ended. SIGINT and
-    SIGTERM are such a point too: a checkpoint is saved, and :class:`~sb3_crc.checkpoints.signals.TrainingStopped`, a
+    agree, and at the end; they are written by another thread. The file DONE tells that the training has ended. After SIGINT or
+    SIGTERM one more is saved at the next such point, and :class:`~sb3_crc.checkpoints.signals.TrainingStopped`, a
     KeyboardInterrupt, is raised. Where none comes within 5 seconds, training stops between two updates or steps, and the last
     checkpoint is the one to go on from. A second signal ends the process at once.
+
+    An error that ends the training, of the environment for instance, is not seen by callbacks: folder and signals are held
+    until :meth:`close`, or until this process trains into the folder again or gets a signal.
 
     A disk that is full, read-only or failing does not end the training: each checkpoint that cannot be written is told of at
     once, and all of them at the end, with the last one that is whole. The log's and Monitor's files get what fits.
@@ -47,8 +47,8 @@ class TrainingCheckpoint(BaseCallback):
     :param monitor_dir: of :func:`~stable_baselines3.common.env_util.make_vec_env`, whose files would begin anew after an
         interruption where environments live in other processes; in this process the files are found without it
     :param verbose: 1: say from where the training goes on
-    :raises ValueError: for arguments that cannot work; when training starts, if another process uses the folder, if what is in
-        it is damaged or does not fit the model, or if the model's replay buffer is not a FrameReplayBuffer
+    :raises ValueError: for arguments that cannot work; when training starts, if another training uses the folder, if what is
+        in it is damaged or does not fit the model, or if the model's replay buffer is not a FrameReplayBuffer
     """
 
     model: OffPolicyAlgorithm
@@ -68,11 +68,12 @@ class TrainingCheckpoint(BaseCallback):
         self.store = CheckpointStore(Path(folder), keep)
         self.monitor_dir = None if monitor_dir is None else Path(monitor_dir)
         self._saved_at = 0
-        self._lock = FileLock(Path(folder) / LOCK)
+        self._lock = RunLock(Path(folder), self.close)
         self._writer: ThreadPoolExecutor | None = None
         self._writing: Future[Path] | None = None
         self._whole: Path | None = None
-        self._segments: tuple[Any, ...] = ()
+        #: The buffer that is being written, and its segments before
+        self._before: tuple[FrameReplayBuffer, tuple[Any, ...]] | None = None
         self._failures = 0
         self._saved_whole = True
         self._request = StopRequest()
@@ -89,14 +90,17 @@ class TrainingCheckpoint(BaseCallback):
                 f"TrainingCheckpoint saves a FrameReplayBuffer, frame by frame; the model has a {name}: "
                 "replay_buffer_class=FrameReplayBuffer"
             )
-        self._take_lock()
+        self._lock.take()
+        (self.store.folder / DONE).unlink(missing_ok=True)
 
     def _on_training_start(self) -> None:
+        if not self._lock.is_held:
+            raise ValueError(f"{self.store.folder}: two TrainingCheckpoints of one training cannot share a folder")
         self._writer = ThreadPoolExecutor(1, "checkpoint")
-        self._failures = 0
+        self._failures, self._saved_whole = 0, True
         endure(self.logger, self.training_env, self.monitor_dir)
         self._request = StopRequest()
-        self._request.listen()
+        self._request.listen(self.model)
         if hasattr(self.model, "between_updates"):  # an attribute that a stock algorithm does not know would be saved with it
             self.model.between_updates = self._stop_if_overdue
         checkpoint = self.store.newest()
@@ -114,6 +118,7 @@ class TrainingCheckpoint(BaseCallback):
         read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
         self._whole = checkpoint.path
         set_training_state(self.model, self.locals["callback"], checkpoint.state)
+        self._saved_whole = True  # unlike the one before it, perhaps, as that state has it
         self._saved_at = self.num_timesteps = self.model.num_timesteps
         for one in callback_tree(self.locals["callback"]):
             if isinstance(one, ProgressBarCallback):
@@ -180,9 +185,15 @@ class TrainingCheckpoint(BaseCallback):
         buffer, steps = self.model.replay_buffer, self.model.num_timesteps
         assert isinstance(buffer, FrameReplayBuffer)
         assert self._writer is not None
-        self._saved_at, self._segments = steps, buffer.segments
-        replay = contents(buffer, self.store.segments, buffer.segments)
-        state = training_state(self.model, self.locals["callback"])
+        self._saved_at, self._before = steps, (buffer, buffer.segments)
+        try:
+            replay = contents(buffer, self.store.segments, buffer.segments)
+            state = training_state(self.model, self.locals["callback"])  # reads the files of the log
+        except OSError as error:
+            if not is_of_disk(error):
+                raise
+            self._tell_of(error)
+            return
         buffer.segments = replay.segments
         self._writing = self._writer.submit(self.store.save, steps, state, replay)
 
@@ -198,30 +209,21 @@ class TrainingCheckpoint(BaseCallback):
         try:
             self._whole = writing.result()
         except OSError as error:
-            self._failures += 1
-            buffer = self.model.replay_buffer
-            assert isinstance(buffer, FrameReplayBuffer)
-            buffer.segments = self._segments
+            assert self._before is not None
+            buffer, segments = self._before
+            buffer.segments = segments
             self.store.remove_unfinished()
-            before = f"{self._whole} is whole" if self._whole else "there is none before it"
-            warnings.warn(
-                f"the checkpoint of {self._saved_at} agent steps could not be written: {error}. Training goes on, {before}, "
-                f"and the next one is due {self.every} steps later",
-                stacklevel=2,
-            )
-            self._saved_whole = False
+            self._tell_of(error)
         else:
             self._saved_whole = True
         return self._saved_whole
 
-    def _take_lock(self) -> None:
-        self.store.folder.mkdir(parents=True, exist_ok=True)
-        owner = self.store.folder / OWNER
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            who = owner.read_text(encoding="utf-8").strip() if owner.exists() else "unknown"
-            raise ValueError(f"{self.store.folder} is in use by another training: {who}") from None
-        (self.store.folder / DONE).unlink(missing_ok=True)
-        about = {"pid": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
-        owner.write_text(json.dumps(about) + "\n", encoding="utf-8")
+    def _tell_of(self, error: OSError) -> None:
+        self._failures += 1
+        self._saved_whole = False
+        before = f"{self._whole} is whole" if self._whole else "there is none before it"
+        warnings.warn(
+            f"the checkpoint of {self._saved_at} agent steps could not be written: {error}. Training goes on, {before}, "
+            f"and the next one is due {self.every} steps later",
+            stacklevel=3,
+        )
