@@ -28,13 +28,10 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.image_spaces import image_shape, image_space
-from sb3_crc.plain import unique_keys
+from sb3_crc.plain import ACTIVATIONS, unique_keys
 from sb3_crc.policies import CRCPolicy
 
 FORMAT = "sb3_crc policy 1"
-ACTIVATIONS: dict[str, type[nn.Module]] = {
-    one.__name__: one for one in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.LeakyReLU, nn.SiLU, nn.Mish)
-}
 #: Arguments of the policy that are written as they are, and of its encoder
 POLICY_ARGUMENTS = ("net_arch", "n_critics", "actor_features", "log_std_bounds", "layer_norm")
 ENCODER_ARGUMENTS = (
@@ -62,10 +59,13 @@ def export_policy(
     :param model: a CRCSAC, or its policy
     :param path: file to write, which appears whole; ``.sb3crc`` is added where there is no suffix
     :param task: domain-task on which it acts, for ``sb3-crc enjoy``
-    :param env_kwargs: of :func:`~sb3_crc.make_dmc` there, plain data
+    :param env_kwargs: of :func:`~sb3_crc.make_dmc` there, plain data: some of :data:`ENVIRONMENT_ARGUMENTS`
     :return: the file
-    :raises ValueError: if it has parts that such a file cannot describe: classes of the user's own, spaces of other kinds
+    :raises ValueError: if it has parts that such a file cannot describe: classes of the user's own, spaces of other kinds,
+        other arguments of the environment
     """
+    if unknown := sorted(set(env_kwargs or {}) - set(ENVIRONMENT_ARGUMENTS)):
+        raise ValueError(f"env_kwargs: {', '.join(unknown)} is none of {', '.join(ENVIRONMENT_ARGUMENTS)}")
     policy = model.policy if isinstance(model, CRCSAC) else model
     target = Path(path) if Path(path).suffix else Path(path).with_suffix(".sb3crc")
     about = {"format": FORMAT, "configuration": json.dumps(_describe(policy))}
@@ -224,6 +224,9 @@ def _read(text: str, source: Path) -> dict[str, Any]:
         encoder = given["features_extractor_kwargs"]
         if not isinstance(encoder, dict) or not encoder.keys() <= set(ENCODER_ARGUMENTS):
             raise ValueError(f"features_extractor_kwargs must hold some of {', '.join(ENCODER_ARGUMENTS)}")
+        low, high = given["log_std_bounds"]
+        if not float(low) < float(high):
+            raise ValueError(f"log_std_bounds={given['log_std_bounds']}: the first must be less than the second")
         for number in _numbers(given):
             if not abs(number) <= LARGEST:
                 raise ValueError(f"{number} is more than {LARGEST}")
@@ -235,7 +238,7 @@ def _read(text: str, source: Path) -> dict[str, Any]:
             "observation_space": _space(given["observation_space"]),
             "action_space": _space(given["action_space"]),
         }
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except Exception as error:  # numpy and Gymnasium raise nearly anything for what strangers write
         raise PolicyFileError(f"{source}: its configuration cannot be used: {error}") from error
 
 

@@ -24,26 +24,23 @@ from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.policies import CRCPolicy
 
+#: Activation functions that may be named
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    one.__name__: one for one in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.LeakyReLU, nn.SiLU, nn.Mish)
+}
 #: Classes that may be named
-CLASSES: dict[str, type] = {
+CLASSES: dict[str, type] = ACTIVATIONS | {
     one.__name__: one
     for one in (
-        *(
-            CRCPolicy,
-            PixelEncoder,
-            FrameReplayBuffer,
-            DictFrameReplayBuffer,
-            ReplayBuffer,
-            DictReplayBuffer,
-            NStepReplayBuffer,
-        ),
-        *(nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.LeakyReLU, nn.SiLU, nn.Mish),
+        *(CRCPolicy, PixelEncoder, FrameReplayBuffer, DictFrameReplayBuffer),
+        *(ReplayBuffer, DictReplayBuffer, NStepReplayBuffer),
         *(th.optim.Adam, th.optim.AdamW, th.optim.RMSprop, th.optim.SGD),
     )
 }
 #: Bytes of an array that is given as such
 LARGEST_ARRAY = 1 << 28
-ARRAY_TYPES = "biuf?"
+#: Kinds of NumPy's types that are numbers
+ARRAY_TYPES = "biuf"
 
 
 class NotPlain(ValueError):
@@ -86,16 +83,14 @@ def from_plain(form: Any) -> Any:
             return _read_array(form)[()]
         _, _, read = _FORMS[kind]
         return read(form)
-    except (KeyError, TypeError, ValueError, AttributeError, AssertionError, EOFError) as error:
+    except Exception as error:  # numpy and Gymnasium raise nearly anything for what strangers write
         raise NotPlain(f"no plain form of a value: {str(form)[:80]!r}: {error}") from error
 
 
 def plain_attributes(data: Mapping[str, Any]) -> str:
-    """:param data: attributes of a model; :return: JSON of those that have a plain form, but for SB3 are pickles"""
+    """:param data: attributes of a model; :return: JSON of those that have a plain form"""
     found = {}
     for name, value in data.items():
-        if _is_json(value):
-            continue
         try:
             found[name] = to_plain(value)
         except NotPlain:
@@ -106,6 +101,7 @@ def plain_attributes(data: Mapping[str, Any]) -> str:
 def read_plain_attributes(text: str | bytes) -> dict[str, Any]:
     """
     :param text: of :func:`plain_attributes`, from anyone
+    :return: the attributes, by name
     :raises NotPlain: if it is no such text
     """
     try:
@@ -115,15 +111,6 @@ def read_plain_attributes(text: str | bytes) -> dict[str, Any]:
     if not isinstance(forms, dict):
         raise NotPlain("no JSON mapping")
     return {name: from_plain(form) for name, form in forms.items()}
-
-
-def _is_json(value: Any) -> bool:
-    """Does SB3 write it as it is? It asks json itself."""
-    try:
-        json.dumps(value)
-    except (TypeError, OverflowError, ValueError):
-        return False
-    return True
 
 
 def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

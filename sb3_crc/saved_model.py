@@ -15,8 +15,9 @@ from sb3_crc.plain import NotPlain, plain_attributes, read_plain_attributes
 
 #: In the zip, beside SB3's own "data"
 PLAIN = "plain.json"
+#: Key of what SB3 has pickled among the settings
 PICKLE = ":serialized:"
-#: Bytes of it when it is unpacked, at most
+#: Bytes of the plain attributes when they are unpacked, at most
 LARGEST = 1 << 29
 
 
@@ -28,20 +29,15 @@ def check_saved_model(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str,
     :raises ValueError: if it is damaged, truncated, no zip, or the model of another algorithm
     """
     try:
-        with _opened(path) as file, zipfile.ZipFile(file) as archive:
-            # A truncated file may end with a whole .pth, which is a zip as well: hence the look for "data"
-            damaged = "data" if "data" not in archive.namelist() else archive.testzip()
-            settings = {} if damaged else json.loads(archive.read("data"))
+        with _opened(path) as file:
+            settings = _read_settings(file, path)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"there is no saved model {path}") from error
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{path} wasn't a zip-file, or is truncated or damaged: {error}") from error
-    if damaged:
-        raise ValueError(f"{path} is not a complete model: {damaged!r} is missing or damaged (truncated copy?)")
-    if "encoder_tau" not in settings:
-        policy = settings.get("policy_class", {})
+    if not isinstance(settings, dict) or "encoder_tau" not in settings:
+        policy = settings.get("policy_class") if isinstance(settings, dict) else None
+        module = policy.get("__module__") if isinstance(policy, dict) else None
         raise ValueError(
-            f"{path} was not saved by CRCSAC (its policy is of {policy.get('__module__', 'an unknown module')}); "
+            f"{path} was not saved by CRCSAC (its policy is of {module or 'an unknown module'}); "
             "load it with the class that saved it, e.g. stable_baselines3.SAC"
         )
     return settings
@@ -99,6 +95,19 @@ def check_pickles(path: object, saved: Mapping[str, object], given: Mapping[str,
 def pickled_names(saved: Mapping[str, object]) -> list[str]:
     """:param saved: what SB3 has written about a model; :return: attributes that it would unpickle"""
     return [name for name, value in saved.items() if isinstance(value, dict) and PICKLE in value]
+
+
+def _read_settings(file: IO[bytes], path: object) -> Any:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            # A truncated file may end with a whole .pth, which is a zip as well: hence the look for "data"
+            damaged = "data" if "data" not in archive.namelist() else archive.testzip()
+            settings = {} if damaged else json.loads(archive.read("data"))
+    except Exception as error:  # damaged bytes make zipfile, zlib and json raise nearly anything
+        raise ValueError(f"{path} wasn't a zip-file, or is truncated or damaged: {error}") from error
+    if damaged:
+        raise ValueError(f"{path} is not a complete model: {damaged!r} is missing or damaged (truncated copy?)")
+    return settings
 
 
 @contextmanager

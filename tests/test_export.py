@@ -106,6 +106,8 @@ def test_what_cannot_be_described(tmp_path: Path) -> None:
         export_policy(make_model(policy_kwargs={**POLICY_KWARGS, "features_extractor_class": Own}), tmp_path / "policy")
     with pytest.raises(ValueError, match="activation_fn=Softsign cannot be described"):
         export_policy(make_model(policy_kwargs={**POLICY_KWARGS, "activation_fn": nn.Softsign}), tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"env_kwargs: distraction is none of image_size"):
+        export_policy(make_model(), tmp_path / "policy", task="cartpole-swingup", env_kwargs={"distraction": "color_easy"})
     assert not list(tmp_path.iterdir())
 
 
@@ -137,12 +139,15 @@ def weight(value: Any) -> Any:
         (to("observation_space", "shape", value=[9, 1 << 20, 1 << 20]), "no space of shape"),
         (to("observation_space", "shape", value=[1, 7000, 7000]), "should be"),
         (to("observation_space", "dtype", value="O"), "no space of shape"),
+        (to("observation_space", "dtype", value="f4,(2,"), "cannot be used"),
         (to("action_space", "shape", value=[5]), "should be"),
         (to("activation_fn", value="__import__"), "is none of ReLU"),
         (to("features_extractor_kwargs", value={"own": 1}), "must hold some of"),
         (to("net_arch", value="dict(pi=[])"), "no policy can be made"),
         (to("own", value=1), "own: missing, or not known"),
         (to("log_std_bounds", value=[float("nan"), 1]), "NaN is no number"),
+        (to("log_std_bounds", value=[2, -10]), "the first must be less"),
+        (to("log_std_bounds", value="ab"), "cannot be used"),
         (weight(lambda one: one * float("nan")), "not finite"),
         (weight(lambda one: one.double()), "float64"),
         (weight(lambda one: one[:, :-1].contiguous()), "actor.mu.weight is"),

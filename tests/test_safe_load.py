@@ -139,10 +139,29 @@ def test_files_of_before_and_of_strangers(tmp_path: Path) -> None:
         CRCSAC.load(older, device="cpu")
     with pytest.raises(ValueError, match="would execute"):
         CRCSAC.load(older, device="cpu", safe=True)
-    for text in ("[]", "{", '{"a": 1, "a": 2}', '{"a": {"type": "class", "name": "Popen"}}', "[" * 100_000):
+    deep = '{"type": "list", "items": [' * 400 + "]}" * 400
+    box = '{"type": "box", "shape": [3], "dtype": "f4,(2,"}'
+    forms = ('{"type": "class", "name": "Popen"}', '{"type": "discrete", "n": Infinity, "start": 0}', box, deep)
+    for text in ("[]", "{", '{"a": 1, "a": 2}', "[" * 100_000, *(f'{{"a": {form}}}' for form in forms)):
         hostile = rewritten(tmp_path / "model.zip", tmp_path / "hostile.zip", **{PLAIN: text})
         with pytest.raises(ValueError, match=r"plain\.json cannot be read"):
             CRCSAC.load(hostile, device="cpu")
+
+
+def test_damaged_files_are_named(tmp_path: Path) -> None:
+    """Whatever zipfile raises of them."""
+    make_model().save(tmp_path / "model")
+    whole = (tmp_path / "model.zip").read_bytes()
+    entry, path = whole.rindex(b"PK\x01\x02"), tmp_path / "damaged.zip"
+    for place, byte in ((8, 1), (10, 99), (10, 8)):  # encrypted; by an unknown method; compressed
+        content = bytearray(whole)
+        content[entry + place] = byte
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"damaged\.zip wasn't a zip-file, or is truncated or damaged: ."):
+            CRCSAC.load(path, device="cpu")
+    for data, message in (("{", "damaged: "), ("[]", "not saved by CRCSAC"), ('{"policy_class": 1}', "not saved by CRCSAC")):
+        with pytest.raises(ValueError, match=rf"damaged\.zip.*{message}"):
+            CRCSAC.load(rewritten(tmp_path / "model.zip", path, data=data), device="cpu")
 
 
 def test_sb3_reads_them_too(tmp_path: Path) -> None:
