@@ -67,7 +67,11 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def named_shortage() -> Iterator[list[str]]:
-    """:return: filled, in place of an error, if memory is short: what it said"""
+    """
+    Catch the error that comes where memory is short.
+
+    :return: a list that is empty, and afterwards holds what the error said
+    """
     said: list[str] = []
     try:
         yield said
@@ -102,9 +106,10 @@ def free_memory(device: th.device) -> int:
 
 
 def available_memory(control_groups: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes this process can still allocate: the machine's free memory, or what a container's limit leaves if that is less.
-
+    """
     :param control_groups: where the kernel shows the process's control group (version 2, or version 1 under ``memory/``)
+    :return: bytes this process can still allocate: the machine's free memory, or what a container's limit leaves if that is
+        less
     """
     available = psutil.virtual_memory().available
     for limit, usage, cache in (

@@ -185,6 +185,7 @@ def contents(buffer: FrameReplayBuffer, folder: Path, written: tuple[Segment, ..
     :param buffer: what is to be saved
     :param folder: where segments lie
     :param written: the segments that were written for this buffer before
+    :return: what a save has to write
     """
     segments, new = _segments(buffer, _Folder(folder), written)
     frames = {segment.name: buffer.store.read(segment.first, segment.end) for segment in new}
@@ -313,8 +314,8 @@ def _read_pickle(buffer: FrameReplayBuffer, source: Path | io.BufferedIOBase) ->
             raise ValueError(f"{name} is {getattr(other, name)} there and {getattr(buffer, name)} here")
     if isinstance(other, FrameReplayBuffer):
         loaded = other
-        loaded.n_steps, loaded.gamma, loaded.device = buffer.n_steps, buffer.gamma, buffer.device
-        loaded.frame_device = buffer.frame_device
+        loaded.n_steps, loaded.gamma = buffer.n_steps, buffer.gamma
+        loaded.device, loaded.frame_device = buffer.device, buffer._frame_device
     else:
         loaded = buffer.empty_copy(other.buffer_size * other.n_envs, buffer.frame_channels)
         oldest = other.pos if other.full else 0

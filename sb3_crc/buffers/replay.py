@@ -268,7 +268,8 @@ class FrameReplayBuffer(PlacedReplayBuffer):
         As ``sample``, but the observations stay in the store: read them before anything is added.
 
         :param batch_size: B
-        :param env: normalises rewards
+        :param env: normalises rewards, and observations if it does so; these are gathered at once
+        :return: B transitions, drawn with replacement
         """
         rows = np.random.randint(0, self._rows_to_sample(), size=batch_size)
         return self._frame_samples(rows, env)
