@@ -196,7 +196,7 @@ def _pictures(source: str | None, size: tuple[int, int], device: th.device) -> t
         smooth = F.interpolate(coarse, size, mode="bicubic", align_corners=False)
         return (255 * smooth.clamp(0, 1)).to(th.uint8)
     endings = (".jpg", ".jpeg", ".png", ".webp")
-    files = sorted(path for path in Path(source).rglob("*") if path.suffix.lower() in endings)[:1_000]
+    files = sorted(path for path in Path(source).expanduser().rglob("*") if path.suffix.lower() in endings)[:1_000]
     if not files:
         raise ValueError(f"random_overlay: no pictures ({', '.join(endings)}) in {source!r}")
     pictures = np.stack([_picture(file, size) for file in files])

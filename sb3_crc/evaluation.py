@@ -32,8 +32,9 @@ class QBiasEvalCallback(EvalCallback):
     gamma^t (r_t - alpha log pi(a|s_t)), and where the time limit ended the episode
     gamma^T (min Q(s_T, a) - alpha log pi(a|s_T)), with actions a drawn from the policy (Haarnoja et al. 2018,
     arXiv 1812.05905, eq. 3). The evaluation itself acts by the policy's mean, so even a perfect critic shows a small bias; a
-    growing one is overestimation. Rewards count with ``reward_scale``. Arguments are EvalCallback's; for other algorithms
-    nothing of this is logged.
+    growing one is overestimation. Rewards are those of the evaluation's environment times ``reward_scale``: where VecNormalize
+    changes those of the training alone, the bias says nothing. Arguments are EvalCallback's; for other algorithms nothing of
+    this is logged.
 
     For every algorithm the k-th evaluation begins with the same seed, so that methods and seeds meet the same initial states;
     and ``evaluations.npz`` also holds ``seeds``, ``updates`` (gradient steps) and ``seconds`` of training, without

@@ -1,10 +1,21 @@
 """Augmentations: bytes in, bytes out, every offset, one offset per stack."""
 
+from pathlib import Path
+
 import pytest
 import torch as th
+from PIL import Image
 from torch.nn import functional as F
 
-from sb3_crc.augmentations import AUGMENTATIONS, center_crop, random_conv, random_crop, random_shift, takes_size
+from sb3_crc.augmentations import (
+    AUGMENTATIONS,
+    center_crop,
+    random_conv,
+    random_crop,
+    random_overlay,
+    random_shift,
+    takes_size,
+)
 
 
 def coordinates(batch: int, size: int) -> th.Tensor:
@@ -87,3 +98,12 @@ def test_bad_sizes_are_named() -> None:
         random_crop(images, 21)
     with pytest.raises(ValueError, match="pad=-1"):
         random_shift(images, -1)
+
+
+def test_pictures_may_lie_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shell expands what a configuration says."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "places").mkdir()
+    Image.new("RGB", (8, 8), (10, 20, 30)).save(tmp_path / "places" / "one.png")
+    overlaid = random_overlay(th.zeros(1, 3, 6, 6, dtype=th.uint8), alpha=1.0, source="~/places")
+    assert overlaid[0, :, 0, 0].tolist() == [10, 20, 30]

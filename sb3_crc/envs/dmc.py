@@ -309,7 +309,8 @@ class PixelStack(DecisionEnv):
 class DictStack(PixelStack):
     """The stack of a :class:`PixelStack` under "pixels", beside the task's own observations as float32 (n,).
 
-    :param env: an environment whose observations are a dictionary with uint8 (S, S, 3) under "pixels"
+    :param env: an environment whose observations are a dictionary with uint8 (S, S, 3) under "pixels"; the other parameters
+        are those of :class:`PixelStack`
     """
 
     image_key = IMAGE_KEY

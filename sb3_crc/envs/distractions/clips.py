@@ -145,7 +145,7 @@ def _resized(path: Path, side: int) -> np.ndarray:
     about = path.stat()
     identity = f"{FORMAT} {path.resolve()} {about.st_size} {about.st_mtime_ns} {side}"
     kept = _cache() / f"{path.stem}-{side}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npy"
-    with suppress(OSError, ValueError, EOFError):  # there is none, or the disk was full when it was written
+    with suppress(OSError, ValueError, EOFError):  # there is none, or it is damaged
         return np.asarray(np.load(kept, mmap_mode="r"))
     kept.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(kept) as unfinished:

@@ -7,6 +7,7 @@ the camera is moved in its own frame, so that one rule serves cameras from the s
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ OTHER_FLOOR_ALPHA = 0.3
 #: Of the sky, one square picture for all its faces: at 800, dm_control's own, uploading takes ten times as long
 SKY_SIDE = 128
 
-Render = Any
+Render = Callable[..., np.ndarray]
 State = dict[str, Any]
 
 
@@ -40,6 +41,7 @@ class ControlSuite:
     :param camera_id: which camera moves
     :param action_repeat: control steps per decision
     :param dynamic: False: what a reset draws stays for the episode
+    :raises ValueError: for MuJoCo's free camera, which cannot be moved; for clips as :class:`StoredClip`
     """
 
     visible = True
