@@ -22,7 +22,6 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.checkpoints.store import checksum
 from sb3_crc.envs.distractions import DISTRACTIONS
 from sb3_crc.envs.dmc import make_dmc
-from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.evaluation import FIRST_SEED as FIRST_TRAINING_SEED
 from sb3_crc.evaluation import SEED_STEP
 from sb3_crc.experiments.final import EPISODES, FIRST_SEED
@@ -75,7 +74,7 @@ def generalize(
     """
     run = policy.run
     _check_modes(modes)
-    if not run.arguments["env"].startswith(f"{NAMESPACE}/"):
+    if not run.is_of_suite:
         raise ValueError(f"{policy.file} was trained in {run.arguments['env']}; only dm_control tasks can be distracted")
     path = run.folder / FOLDER / f"{policy.file.stem}-generalization.json"
     about = {

@@ -24,7 +24,6 @@ from sb3_crc.analysis.physics import physics_state
 from sb3_crc.analysis.policies import SavedPolicy
 from sb3_crc.atomic import atomic_write
 from sb3_crc.checkpoints.store import checksum
-from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.runs import Run
 from sb3_crc.image_spaces import image_key
 
@@ -149,8 +148,7 @@ def make_environment(run: Run, seed: int, **changes: Any) -> gym.Env[Any, Any]:
         raise ValueError(f"{run.folder} was trained with {wrapped[0]}={run.settings[wrapped[0]]!r}, which is not applied here")
     for package in run.arguments.get("gym_packages") or []:
         importlib.import_module(package)
-    ours = run.arguments["env"].startswith(f"{NAMESPACE}/")
-    seeded = {"seed": seed} if ours else {}  # LQR draws its springs
+    seeded = {"seed": seed} if run.is_of_suite else {}  # LQR draws its springs
     return gym.make(run.arguments["env"], **{**run.env_kwargs, **seeded, **changes})
 
 

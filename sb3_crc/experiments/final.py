@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_crc.analysis.rollouts import make_environment
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.provenance import provenance
 from sb3_crc.experiments.runs import FINAL, Run, write_json
@@ -79,8 +79,7 @@ def evaluate_final(run: Run, *, episodes: int = EPISODES, seed: int = FIRST_SEED
 
 
 def _returns(model: SAC, run: Run, episodes: int, seed: int) -> list[float]:
-    own = {"seed": seed} if run.is_of_suite else {}  # from it follows also what LQR draws when it is made
-    env = DummyVecEnv([lambda: Monitor(gym.make(run.arguments["env"], **{**run.env_kwargs, **own}))])
+    env = DummyVecEnv([lambda: Monitor(make_environment(run, seed))])
     if not run.is_of_suite:
         env.seed(seed)
     try:

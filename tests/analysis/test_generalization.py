@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from matplotlib.image import imread
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -79,6 +80,16 @@ def test_other_environments_are_refused(tmp_path: Path) -> None:
     run = Run(make_run(tmp_path, "rad", env_id=NOISE, env_kwargs={}, train=0))
     with pytest.raises(ValueError, match=f"{NOISE}.*only dm_control"):
         generalize(SavedPolicy(run, run.model))
+
+
+def test_an_environment_that_rl_zoo3_has_wrapped_is_not_taken_for_another(policy: SavedPolicy) -> None:
+    (config,) = policy.run.folder.glob("*/config.yml")
+    config.write_text(yaml.dump({"env_kwargs": ENV_KWARGS, "env_wrapper": ["a.Wrapper"]}))
+    run = Run(policy.run.folder)
+    with pytest.raises(ValueError, match="was trained with env_wrapper="):
+        final_returns(run)
+    with pytest.raises(ValueError, match="was trained with env_wrapper="):
+        generalize(SavedPolicy(run, run.model), ["none"])
 
 
 def trained(callback: GeneralizationCallback | None) -> Any:

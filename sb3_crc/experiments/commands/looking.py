@@ -1,13 +1,12 @@
 """Commands that score, tabulate and draw runs: ``sb3-crc evaluate | table | curves | curve | report``."""
 
-import importlib.util
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from sb3_crc import completion
-from sb3_crc.command import Group, command
+from sb3_crc.command import Group, command, require
 from sb3_crc.console import say, tell
 
 app = typer.Typer()
@@ -100,8 +99,7 @@ def curves(
     from sb3_crc.experiments.convex_weights import convex_weights, draw_weights
     from sb3_crc.experiments.scores import read_scores
 
-    if importlib.util.find_spec("rliable") is None:
-        raise ValueError("curves needs the extra 'analysis': pip install 'sb3-crc[analysis]'")
+    require("analysis", "rliable")
     shares = None if weights is None else convex_weights(weights)  # before much is read
     scores = read_scores(sources)
     written = draw_comparison(scores, output, baseline=baseline, allow_mixed=allow_mixed)
@@ -173,8 +171,7 @@ def report(
     """One page about runs, to be opened in a browser: tables, curves, instruments, settings, films, commands."""
     from sb3_crc.experiments.report.page import write_report
 
-    if lacking := [name for name in ("plotly", "rliable") if importlib.util.find_spec(name) is None]:
-        raise ValueError(f"report needs {' and '.join(lacking)}: pip install 'sb3-crc[analysis]'")
+    require("analysis", "plotly", "rliable")
     left_out = write_report(sources, output, title=title)
     say(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
     for one in left_out:

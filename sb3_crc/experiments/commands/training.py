@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sb3_crc import completion
-from sb3_crc.command import Group, No, command
+from sb3_crc.command import Group, No, command, separated
 from sb3_crc.console import console, on_a_screen, say, show, tell
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def compare(
     from sb3_crc.experiments.specs import compared
 
     specs = compared(
-        [name.strip() for name in presets.split(",") if name.strip()],
+        separated(presets),
         task,
         range(first_seed, first_seed + seeds),
         env_steps=env_steps,
