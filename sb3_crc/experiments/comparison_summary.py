@@ -84,10 +84,18 @@ def listed(title: str, entries: Sequence[str]) -> list[str]:
     return [f"## {title}", "", *(f"- {entry}" for entry in entries), ""] if entries else []
 
 
-def difference_table(compared: Sequence[Difference]) -> list[str]:
-    """:param compared: methods with one baseline, at least one; :return: lines of a table"""
-    header = ("method", "difference of IQMs", "verdict", f"P(method > {compared[0].baseline})")
-    return markdown(header, [(one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")) for one in compared])
+def difference_table(compared: Sequence[Difference], places: Sequence[tuple[str, str]] = ()) -> list[str]:
+    """
+    :param compared: methods with one baseline, at least one
+    :param places: tasks and seeds of each, where they are not the same for all
+    :return: lines of a table
+    """
+    header = ["method", "difference of IQMs", "verdict", f"P(method > {compared[0].baseline})"]
+    rows = [[one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")] for one in compared]
+    if places:
+        header[1:1] = ["tasks", "seeds"]
+        rows = [[method, *place, *figures] for (method, *figures), place in zip(rows, places, strict=True)]
+    return markdown(header, rows)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], marks: Sequence[str] | None = None) -> list[str]:

@@ -116,13 +116,20 @@ def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[flo
 
 
 def _compared(means: "pd.DataFrame", baseline: str) -> Iterator[str]:
-    matrices = score_matrices(means)
-    if len(matrices.scores) < 2:
+    found, places = [], []
+    for method in dict.fromkeys(means["method"]):
+        pair = score_matrices(means[means["method"].isin([baseline, method])])
+        if method == baseline or not pair.scores:
+            continue
+        found += differences(pair.scores, baseline)
+        places.append((", ".join(pair.tasks), ", ".join(map(str, pair.seeds))))
+    if not found:
         return
-    about = f"{', '.join(matrices.tasks)}; seeds {', '.join(map(str, matrices.seeds))}, those that every method has."
-    yield from [f"## Against {baseline}", "", about, ""]
-    yield from difference_table(differences(matrices.scores, baseline))
-    yield from ["", f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0.", ""]
+    yield from [f"## Against {baseline}", "", *difference_table(found, places), ""]
+    yield from _paragraph(
+        "Each method on the tasks and seeds that it and the baseline both have. "
+        f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0."
+    )
 
 
 def _conditions(final: "pd.DataFrame") -> Iterator[str]:

@@ -52,10 +52,17 @@ def test_every_seed_is_shown_and_what_was_not_done(tmp_path: Path) -> None:
     assert (
         "rad on cartpole-swingup, seed 2: absent" in page and "- no run on walker-walk" in page and "- no run of drq" in page
     )
-    assert "seeds 0, 1, those that every method has" in page
+    assert "| crc | cartpole-swingup | 0, 1 | +50 (" in page
     rad = next(line for line in page.splitlines() if line.startswith("| rad"))
     assert rad.endswith("|  |  |")  # two seeds: no chances
     assert "| 813 |" not in page and "P(mean >= 813)" in page and "P(mean >= 851)" in page
+
+
+def test_each_method_is_compared_on_the_seeds_that_it_shares_with_the_baseline(tmp_path: Path) -> None:
+    returns = {"crc": {0: 800, 1: 860, 2: 900}, "rad": {0: 700, 1: 860, 2: 950}, "sac": {1: 100}}
+    page = results_page([scores(tmp_path / f"{name}.csv", name, own) for name, own in returns.items()], baseline="crc")
+    assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page  # one seed of stock SAC costs rad none
+    assert "| sac | cartpole-swingup | 1 | -760 | not resolved (one seed" in page
 
 
 def test_pages_of_nothing_are_refused(tmp_path: Path) -> None:
