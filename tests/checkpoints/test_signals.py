@@ -54,7 +54,8 @@ def test_a_signal_need_not_wait_for_long_updates(tmp_path: Path, monkeypatch: py
 
 def test_after_an_error_a_signal_is_what_it_was_before(tmp_path: Path) -> None:
     """SB3 tells callbacks of no exception, and nobody would look for the request any more."""
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.default_int_handler
+    signal.signal(signal.SIGINT, before)  # not what a training of another test has left
     checkpoint = TrainingCheckpoint(tmp_path)
     with pytest.raises(StoppedError):
         CRCSAC("CnnPolicy", cartpole(0), seed=0, **SETTINGS).learn(STEPS, callback=[checkpoint, Stop(5)])
