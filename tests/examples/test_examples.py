@@ -119,7 +119,7 @@ def test_crcsac_learns_the_frames_from_the_stack(
     assert model.get_env().env_is_wrapped(Monitor) == [True]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_track_is_learned() -> None:
     """Random steering and gas make 9 per cent of a lap; with this seed 60 were measured."""
     from custom_image_env import SMALL, make_track
