@@ -98,11 +98,19 @@ def test_the_check_of_the_augmentation_draws_no_random_numbers() -> None:
         *[("initial_updates", value, ">= 0") for value in (-1, 0.5)],
         *[("reward_scale", value, "finite") for value in (NAN, INFINITY, -INFINITY)],
         *[("max_grad_norm", value, "> 0") for value in (0.0, -1.0, NAN)],
+        *[(name, None, r"\[0, 1\]") for name in ("tau", "gamma")],
     ],
 )
 def test_numbers_out_of_range_are_refused(name: str, value: float, allowed: str) -> None:
     with pytest.raises(ValueError, match=rf"{name}={value}\b.*({allowed})"):
         construct(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["tau", "batch_size", "reward_scale", "max_grad_norm"])
+def test_words_are_no_numbers(name: str) -> None:
+    """As from a YAML file with quotes: comparing them was a TypeError that named nothing."""
+    with pytest.raises(ValueError, match=f"{name}='0.5' must be"):
+        construct(**{name: "0.5"})
 
 
 @pytest.mark.parametrize(
