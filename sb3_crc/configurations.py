@@ -15,7 +15,16 @@ from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK, shared_settings
 
-CONFIGS = Path(__file__).resolve().parents[1] / "zoo_configs"
+_PACKAGE = Path(__file__).resolve().parent
+#: The project's own: in an installed package they are part of it, in a checkout they stand beside it
+CONFIGS = (_PACKAGE if (_PACKAGE / "zoo_configs").is_dir() else _PACKAGE.parent) / "zoo_configs"
+
+
+def shipped(file: Path) -> Path:
+    """:param file: as a user names it; :return: the same, or for ``zoo_configs/...`` that is not there the project's own"""
+    first, *rest = file.parts or ("",)
+    own = CONFIGS.joinpath(*rest)
+    return own if first == CONFIGS.name and not file.exists() and own.is_file() else file
 
 
 def configuration_file(algorithm: str) -> Path:
@@ -25,13 +34,14 @@ def configuration_file(algorithm: str) -> Path:
 
 def read_settings(file: Path, algorithm: str, env_id: str) -> dict[str, Any]:
     """
-    :param file: YAML, loaded safely
+    :param file: YAML, loaded safely; see :func:`shipped`
     :param algorithm: whose settings are wanted
     :param env_id: of Gymnasium; an environment that the file does not name has the settings of ``default``
     :return: settings of rl_zoo3, which share nothing with each other
     :raises FileNotFoundError: if there is no such file
     :raises ValueError: if it has no settings for this environment, or is no such file at all, saying what is there instead
     """
+    file = shipped(file)
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sb3_crc.configurations import CONFIGS, configuration_file, read_settings, settings_for, with_overrides
+from sb3_crc.configurations import CONFIGS, configuration_file, read_settings, settings_for, shipped, with_overrides
 from sb3_crc.stock import shared_settings
 
 ENV = "dmc_pixels/cartpole-swingup-v0"
@@ -190,3 +190,17 @@ def test_what_is_set_is_a_copy() -> None:
 def test_paths_that_lead_nowhere_are_named(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         with_overrides(SETTINGS, overrides)
+
+
+def test_the_projects_own_are_found_from_anywhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    laptop = Path("zoo_configs/laptop.yml")
+    assert read_settings(laptop, "rad", "dmc_pixels/cartpole-swingup-v0")["batch_size"] == 128
+    assert shipped(Path("zoo_configs/sweeps/ablation_1.yml")) == CONFIGS / "sweeps" / "ablation_1.yml"
+    with pytest.raises(FileNotFoundError):
+        read_settings(Path("zoo_configs/desktop.yml"), "rad", "dmc_pixels/cartpole-swingup-v0")
+    with pytest.raises(FileNotFoundError):
+        read_settings(Path("laptop.yml"), "rad", "dmc_pixels/cartpole-swingup-v0")
+    laptop.parent.mkdir()
+    laptop.write_text("default: {batch_size: 7}\n", encoding="utf-8")
+    assert read_settings(laptop, "rad", "dmc_pixels/cartpole-swingup-v0") == {"batch_size": 7}  # one's own comes first

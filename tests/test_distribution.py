@@ -15,6 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = (
     "sb3_crc",
+    "zoo_configs",
     "pyproject.toml",
     "README.md",
     "LICENSE",
@@ -70,9 +71,13 @@ def test_two_builds_are_the_same_bytes(built: tuple[Path, Path], tmp_path: Path)
 
 
 def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(built: tuple[Path, Path]) -> None:
-    package = {
-        path.relative_to(ROOT).as_posix() for path in (ROOT / "sb3_crc").rglob("*") if path.is_file() and path.suffix != ".pyc"
+    files = {
+        top: {
+            path.relative_to(ROOT).as_posix() for path in (ROOT / top).rglob("*") if path.is_file() and path.suffix != ".pyc"
+        }
+        for top in ("sb3_crc", "zoo_configs")
     }
+    package = files["sb3_crc"] | {f"sb3_crc/{name}" for name in files["zoo_configs"]}
     with zipfile.ZipFile(built[1]) as wheel:
         names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert names == package
@@ -123,3 +128,7 @@ def test_readmes_example_runs_with_the_wheel_in_an_empty_environment(built: tupl
     run_example(python, tmp_path)
     commands = subprocess.run([str(tmp_path / "venv/bin/sb3-crc"), "--help"], capture_output=True, text=True, check=False)
     assert commands.returncode == 0, commands.stderr
+    read = "from pathlib import Path; from sb3_crc.configurations import read_settings; "
+    read += "print(read_settings(Path('zoo_configs/laptop.yml'), 'crc', 'dmc_pixels/cartpole-swingup-v0')['batch_size'])"
+    settings = subprocess.run([str(python), "-c", read], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert settings.stdout == "128\n", settings.stderr

@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 from stable_baselines3 import SAC
 
-from sb3_crc.configurations import configuration_file, read_settings, with_overrides
+from sb3_crc.configurations import configuration_file, read_settings, shipped, with_overrides
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.envs.tasks import default_action_repeat, environment_id, split_task
 from sb3_crc.presets import PRESETS
@@ -158,6 +158,7 @@ def read_sweep(file: Path, **overrides: Any) -> list[RunSpec]:
     :raises FileNotFoundError: if it is missing
     :raises ValueError: naming file and key, for what is no sweep
     """
+    file = shipped(file)
     try:
         content = yaml.load(file.read_text(encoding="utf-8"), _UniqueKeys)  # a SafeLoader
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
-from sb3_crc.configurations import configuration_file, settings_for
+from sb3_crc.configurations import configuration_file, settings_for, shipped
 from sb3_crc.disk import is_of_disk
 from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.envs.tasks import NAMESPACE
@@ -60,7 +60,9 @@ class CRCExperimentManager(ExperimentManager):
         own_config = configuration_file(algo)
         # rl_zoo3 has a sac.yml too, for environments of states
         ours = algo not in STOCK or env_id.startswith(f"{NAMESPACE}/")
-        if kwargs.get("config") is None and own_config.exists() and ours:
+        if kwargs.get("config") is not None:
+            kwargs["config"] = str(shipped(Path(kwargs["config"])))
+        elif own_config.exists() and ours:
             kwargs["config"] = str(own_config)
         super().__init__(args, algo, env_id, *rest, **kwargs)
         if self.vec_env_class is SubprocVecEnv:

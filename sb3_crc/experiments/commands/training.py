@@ -118,9 +118,10 @@ def sweep(
     execution: Execution,
 ) -> object:
     """Train the variants of a sweep file as `compare` does its presets. The same command goes on."""
+    from sb3_crc.configurations import shipped
     from sb3_crc.experiments.specs import read_sweep
 
-    conf_file = None if conf_file is None else conf_file.absolute()
+    conf_file = None if conf_file is None else shipped(conf_file).absolute()
     specs = read_sweep(file, seeds=seeds, env_steps=env_steps, conf_file=conf_file)
     return _run(specs, output, execution, pack=pack)
 
