@@ -12,7 +12,8 @@ from sb3_crc.analysis.figures import evolution_figure, save, tsne_figure
 from sb3_crc.analysis.html import write_html
 from sb3_crc.analysis.intervals import mean_over_models, ratio_over_episodes
 from sb3_crc.analysis.subjects import Subject, by_method, by_run
-from sb3_crc.analysis.tables import Row, estimate_columns, estimate_of, markdown, number, write_lines, write_rows
+from sb3_crc.analysis.tables import Row, estimate_columns, estimate_of, number, write_lines, write_rows
+from sb3_crc.experiments.comparison_summary import markdown
 
 EXPLANATION = """\
 Each point is a decision of the policy's own rollout; its colour is the cluster (k-means, {clusters} clusters, of all models'

@@ -13,7 +13,8 @@ import numpy as np
 from sb3_crc.analysis.figures import new_figure, save
 from sb3_crc.analysis.generalization import NONE, ModeReturns, read_records
 from sb3_crc.analysis.policies import SavedPolicy
-from sb3_crc.analysis.tables import markdown, write_lines, write_rows
+from sb3_crc.analysis.tables import write_lines, write_rows
+from sb3_crc.experiments.comparison_summary import markdown
 from sb3_crc.experiments.runs import Run
 
 #: What must be known to read DMControl-GB's figures beside ours

@@ -7,7 +7,8 @@ from typing import Any
 from sb3_crc.analysis.figures import evolution_figure, save, spectrum_figure
 from sb3_crc.analysis.similarity import effective_rank, explained_variance
 from sb3_crc.analysis.subjects import Subject, by_run
-from sb3_crc.analysis.tables import markdown, number, write_lines, write_rows
+from sb3_crc.analysis.tables import number, write_lines, write_rows
+from sb3_crc.experiments.comparison_summary import markdown
 
 NUMBERS = ("return", "effective rank")
 EXPLANATION = """\

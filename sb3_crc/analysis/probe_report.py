@@ -11,7 +11,8 @@ from sb3_crc.analysis.figures import evolution_figure, probe_figure, save
 from sb3_crc.analysis.networks import encode, untrained_extractor
 from sb3_crc.analysis.probes import Probe, pixel_components, probe
 from sb3_crc.analysis.subjects import States, Subject, by_run, common_states, thinned
-from sb3_crc.analysis.tables import Row, estimate_columns, estimate_of, markdown, number, write_lines, write_rows
+from sb3_crc.analysis.tables import Row, estimate_columns, estimate_of, number, write_lines, write_rows
+from sb3_crc.experiments.comparison_summary import markdown
 
 UNTRAINED, PIXELS = "untrained encoder", "PCA of pixels"
 #: Random weights that the untrained encoder is drawn with

@@ -17,7 +17,8 @@ from sb3_crc.analysis.similarity import (
     sample_correlations,
 )
 from sb3_crc.analysis.subjects import Subject, by_run, common_states
-from sb3_crc.analysis.tables import markdown, number, write_lines, write_rows
+from sb3_crc.analysis.tables import number, write_lines, write_rows
+from sb3_crc.experiments.comparison_summary import markdown
 
 #: Feature vectors of each model in the heat map, as in the paper
 SAMPLES = 200

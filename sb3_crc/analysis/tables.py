@@ -40,11 +40,6 @@ def write_rows(rows: Sequence[Row], folder: Path, name: str) -> list[Path]:
     return [table, data]
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """:return: lines of a table"""
-    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
-
-
 def write_lines(lines: Sequence[str], path: Path) -> Path:
     """:return: the path that was written"""
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

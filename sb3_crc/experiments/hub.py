@@ -10,11 +10,11 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crc.analysis.films import film
+from sb3_crc.analysis.rollouts import make_environment
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.experiments.final import FIRST_SEED, load_final
 from sb3_crc.experiments.model_card import CURVE, FILM, POLICY, SETTINGS, environment_arguments, model_card
@@ -48,7 +48,7 @@ def write_repository(run: Run, folder: Path, repo_id: str, *, filmed: bool = Tru
         export_policy(model, folder / POLICY, task=run.task, env_kwargs=environment_arguments(run))
         files[POLICY] = ""
     if filmed and importlib.util.find_spec("av") is not None and run.is_of_suite:
-        env = DummyVecEnv([lambda: gym.make(run.arguments["env"], **{**run.env_kwargs, "seed": FIRST_SEED})])
+        env = DummyVecEnv([lambda: make_environment(run, FIRST_SEED)])
         try:
             files[FILM] = film(model, env, folder / FILM)
         finally:
