@@ -16,6 +16,7 @@ and heads)
 Of Dict observations the image is encoded, and proprioception (the vectors beside it) joins the latent at the heads.
 """
 
+import math
 from typing import Any
 
 import torch as th
@@ -244,6 +245,9 @@ class CRCPolicy(SACPolicy):
         if encoder_steps < 1:
             raise ValueError(f"encoder_steps={encoder_steps} must be at least 1")
         check_name("actor_features", actor_features, ACTOR_FEATURES)
+        low, high = log_std_bounds
+        if not -math.inf < low < high < math.inf:
+            raise ValueError(f"log_std_bounds={tuple(log_std_bounds)} must be two finite numbers, the first below the second")
         self._own_kwargs: dict[str, Any] = {
             "objectives": objectives or {},
             "actor_features": actor_features,

@@ -54,6 +54,12 @@ def test_log_std_is_squashed_into_its_bounds(bounds: tuple[float, float]) -> Non
             assert th.allclose(actor.get_action_dist_params(images)[1], th.tensor(expected, dtype=th.float32))
 
 
+@pytest.mark.parametrize("bounds", [(2, -10), (0, 0), (float("-inf"), 2), (-10, float("nan"))])
+def test_bounds_of_the_log_std_that_bound_nothing_are_refused(bounds: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="log_std_bounds=.*first below the second"):
+        build(log_std_bounds=bounds)
+
+
 def test_optimizer_class_and_arguments_reach_every_optimizer() -> None:
     model = build(optimizer_class=th.optim.AdamW, optimizer_kwargs={"weight_decay": 0.07})
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.policy.encoder_optimizer):
