@@ -202,4 +202,5 @@ def test_an_encoder_of_nothing_is_refused(own: dict[str, Any], message: str) -> 
 
 def test_the_defaults_train() -> None:
     """Else the checks above would show nothing."""
-    check_arguments({})
+    model = CRCSAC("CnnPolicy", NoiseEnv(size=36, length=5), **TINY).learn(10)
+    assert model._n_updates == 2

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from hypothesis import strategies as st
 
 from sb3_crc.configurations import read_settings, with_overrides
@@ -120,5 +119,6 @@ def test_a_path_that_is_no_text_is_refused() -> None:
 
 def test_the_unedited_files_are_read() -> None:
     """Else the checks above would show nothing."""
-    check_configurations([(0.0, "", 0)], "crc")
-    assert yaml.safe_load(LAPTOP) and yaml.safe_load(SWEEP)
+    assert read_settings(ROOT / "zoo_configs" / "laptop.yml", "crc", "dmc_pixels/cartpole-swingup-v0")
+    assert read_sweep(ROOT / "zoo_configs" / "sweeps" / "ablation_1.yml")
+    assert edited(LAPTOP, [(0.0, "", 0)]) == LAPTOP and edited(SWEEP, [(0.0, "#", 0)]) == f"#{SWEEP}"
