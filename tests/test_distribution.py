@@ -84,6 +84,17 @@ def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(built: tuple
     assert {"sb3_crc/py.typed", "sb3_crc/experiments/published.csv", "sb3_crc/experiments/report/page.js"} <= names
 
 
+def test_the_wheel_brings_its_configurations(built: tuple[Path, Path], tmp_path: Path) -> None:
+    with zipfile.ZipFile(built[1]) as wheel:
+        wheel.extractall(tmp_path / "site")
+    read = "from pathlib import Path; from sb3_crc.configurations import CONFIGS, read_settings; print(CONFIGS); "
+    read += "print(read_settings(Path('zoo_configs/laptop.yml'), 'crc', 'dmc_pixels/cartpole-swingup-v0')['batch_size'])"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    command = [sys.executable, "-c", read]
+    outcome = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert outcome.stdout.splitlines() == [str(tmp_path / "site/sb3_crc/zoo_configs"), "128"], outcome.stderr
+
+
 def test_the_sdist_is_small_and_holds_no_results(built: tuple[Path, Path]) -> None:
     with tarfile.open(built[0]) as sdist:
         tops = {name.split("/")[1] for name in sdist.getnames()}
@@ -128,7 +139,3 @@ def test_readmes_example_runs_with_the_wheel_in_an_empty_environment(built: tupl
     run_example(python, tmp_path)
     commands = subprocess.run([str(tmp_path / "venv/bin/sb3-crc"), "--help"], capture_output=True, text=True, check=False)
     assert commands.returncode == 0, commands.stderr
-    read = "from pathlib import Path; from sb3_crc.configurations import read_settings; "
-    read += "print(read_settings(Path('zoo_configs/laptop.yml'), 'crc', 'dmc_pixels/cartpole-swingup-v0')['batch_size'])"
-    settings = subprocess.run([str(python), "-c", read], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert settings.stdout == "128\n", settings.stderr

@@ -1,5 +1,6 @@
 """SIGKILL at random moments."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -46,11 +47,15 @@ def test_kills_at_random_moments(tmp_path: Path) -> None:
         process = start("killed")
         try:
             result, _ = process.communicate(timeout=float(random.uniform(0.3, 0.8)) * duration)
-            break
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             process.communicate()
             kills += 1
+            continue
+        if kills:
+            break
+        shutil.rmtree(tmp_path / "killed")  # the whole run was slower, with other work beside it: earlier, then
+        duration /= 2
     print(f"{kills} kills, {duration:.0f} s for the whole run")
     assert kills > 0 and whole
     assert result == whole
