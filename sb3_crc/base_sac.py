@@ -23,10 +23,9 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.buffers import DictFrameReplayBuffer, FrameReplayBuffer
 from sb3_crc.buffers.files import load_buffer_file, save_buffer_file
 from sb3_crc.checked_sac import LOSSES, CheckedSAC
-from sb3_crc.convolutions import fastest_convolutions
+from sb3_crc.convolutions import fast_updates
 from sb3_crc.finite import LossHistory
 from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm, Speedometer, watched
-from sb3_crc.memory import memory_kept
 from sb3_crc.overlap import EarlyUpdates
 from sb3_crc.policies import CRCActor, CRCCritic, CRCPolicy
 from sb3_crc.recording import RecordedUpdates, recorded_updates, unprepare
@@ -182,7 +181,7 @@ class BaseCRCSAC(CheckedSAC):
         freed memory until the end (:func:`~sb3_crc.memory.memory_kept`), on a GPU it looks for the fastest convolutions
         (:func:`~sb3_crc.convolutions.fastest_convolutions`).
         """
-        with memory_kept() if self.device.type == "cpu" else fastest_convolutions():
+        with fast_updates(self.device):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(

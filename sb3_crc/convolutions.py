@@ -8,7 +8,7 @@ B batch, C channels, H, W height and width.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import torch as th
@@ -16,6 +16,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from sb3_crc.memory import memory_kept
 from sb3_crc.settings import check_name
 
 Pair = tuple[int, int]
@@ -50,6 +51,14 @@ def fastest_convolutions() -> Iterator[None]:
         yield
     finally:
         th.backends.cudnn.benchmark = before
+
+
+def fast_updates(device: th.device) -> AbstractContextManager[None]:
+    """
+    What ``learn()`` sets in the process to learn fast on ``device``: on a CPU :func:`~sb3_crc.memory.memory_kept`, otherwise
+    :func:`fastest_convolutions`.
+    """
+    return memory_kept() if device.type == "cpu" else fastest_convolutions()
 
 
 def conv_relu(images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: Pair) -> th.Tensor:

@@ -73,7 +73,7 @@ def export_policy(
         about["environment"] = json.dumps({"task": task, "env_kwargs": dict(env_kwargs or {})})
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in _weights(policy).items()}
     with atomic_write(target) as unfinished:
-        safetensors.torch.save_file(weights, unfinished, about)
+        unfinished.write_bytes(safetensors.torch.save(weights, about))  # save_file() would let nobody else read it
     return target
 
 

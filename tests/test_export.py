@@ -98,6 +98,11 @@ def test_where_it_acts(tmp_path: Path, exported: Path) -> None:
         environment_of(exported)
 
 
+def test_colleagues_may_read_it(tmp_path: Path, exported: Path) -> None:
+    (mine := tmp_path / "mine").touch()
+    assert exported.stat().st_mode == mine.stat().st_mode
+
+
 def test_what_cannot_be_described(tmp_path: Path) -> None:
     class Own(PixelEncoder):
         pass

@@ -5,6 +5,11 @@ import subprocess
 import sys
 
 import pytest
+from stable_baselines3 import SAC
+
+import sb3_crc.memory
+from sb3_crc.stock import STOCK
+from tests.conftest import NoiseEnv, make_model
 
 FAULTS = """
 import resource, sys
@@ -41,10 +46,24 @@ def test_pages_are_touched_once_and_given_back() -> None:
     assert afterwards < 5e6
 
 
-def test_a_system_without_glibc_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sb3_crc.memory
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has these settings")
+@pytest.mark.parametrize("algorithm", ["crc", "sac", "sac_matched"])
+def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str) -> None:
+    kept = []
+    outside = sb3_crc.memory._keepers  # benchmarks of the same process keep theirs until its end
 
+    def note(local_variables: object, global_variables: object) -> bool:
+        kept.append(sb3_crc.memory._keepers - outside)
+        return True
+
+    model: SAC = make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20)
+    model.learn(3, callback=note)
+    assert kept == [1, 1, 1]
+    assert sb3_crc.memory._keepers == outside
+
+
+def test_a_system_without_glibc_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sb3_crc.memory, "_glibc", lambda: None)
-    keepers = sb3_crc.memory._keepers  # benchmarks of the same process keep theirs until its end
+    keepers = sb3_crc.memory._keepers
     with sb3_crc.memory.memory_kept():
         assert sb3_crc.memory._keepers == keepers

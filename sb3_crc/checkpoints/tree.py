@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 #: What a tree is made of: None, numbers, strings, arrays and tensors, in dictionaries, lists, tuples and deques
 Tree = Any
@@ -41,7 +41,7 @@ def write_tree(tree: Tree, folder: Path) -> None:
     """
     arrays: dict[str, th.Tensor] = {}
     structure = _encode(tree, arrays, "")
-    save_file(arrays, folder / ARRAYS)
+    (folder / ARRAYS).write_bytes(save(arrays))  # save_file() would let nobody else read it
     (folder / STRUCTURE).write_text(json.dumps(structure), encoding="utf-8")
 
 

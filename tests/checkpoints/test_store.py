@@ -19,6 +19,14 @@ def test_only_the_newest_stay_and_segments_that_they_need(tmp_path: Path) -> Non
     assert not list(tmp_path.glob(".unfinished*"))
 
 
+def test_colleagues_may_read_it(tmp_path: Path) -> None:
+    (mine := tmp_path / "mine").touch()
+    train(tmp_path / "run", stop=25)
+    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert {path.name for path in files} > {"arrays.safetensors", "structure.json", MANIFEST}
+    assert {path.stat().st_mode for path in files} == {mine.stat().st_mode}
+
+
 def damage(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
