@@ -41,8 +41,13 @@ def write_tree(tree: Tree, folder: Path) -> None:
     """
     arrays: dict[str, th.Tensor] = {}
     structure = _encode(tree, arrays, "")
-    (folder / ARRAYS).write_bytes(save(arrays))  # save_file() would let nobody else read it
+    _write_arrays(arrays, folder / ARRAYS)
     (folder / STRUCTURE).write_text(json.dumps(structure), encoding="utf-8")
+
+
+def _write_arrays(arrays: dict[str, th.Tensor], path: Path) -> None:
+    """As ``save_file()``, which would let nobody but the owner read it."""
+    path.write_bytes(save(arrays))
 
 
 def read_tree(folder: Path) -> Tree:

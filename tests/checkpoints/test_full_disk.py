@@ -22,9 +22,7 @@ class Full(OSError):
     pass
 
 
-@pytest.mark.parametrize(
-    "function", ["numpy.lib.format.write_array", "safetensors.torch.save_file", "numpy.savez", "os.replace"]
-)
+@pytest.mark.parametrize("function", ["numpy.lib.format.write_array", "tree._write_arrays", "numpy.savez", "os.replace"])
 @pytest.mark.parametrize("call", [1, 3])
 def test_a_training_outlives_a_disk_that_is_full(
     function: str, call: int, whole: CRCSAC, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -45,12 +43,9 @@ def test_a_training_outlives_a_disk_that_is_full(
         return wrapper
 
     with monkeypatch.context() as patch:
-        if function == "safetensors.torch.save_file":
-            patch.setattr(tree, "save_file", failing(tree.save_file))
-        else:
-            module, _, name = function.rpartition(".")
-            target = {"numpy.lib.format": np.lib.format, "numpy": np, "os": os}[module]
-            patch.setattr(target, name, failing(getattr(target, name)))
+        module, _, name = function.rpartition(".")
+        target = {"numpy.lib.format": np.lib.format, "tree": tree, "numpy": np, "os": os}[module]
+        patch.setattr(target, name, failing(getattr(target, name)))
         with pytest.warns(UserWarning, match="could not be written") as told:
             train(tmp_path, seed=0, stop=45)
     assert sum("could not be written: no space left. Training goes on" in str(one.message) for one in told) == 1

@@ -30,7 +30,7 @@ STEPS, EVERY, BUFFER_SIZE = 600, 20, 150
 #: What the writer calls, each once or several times for each checkpoint
 WRITER = {
     "frames": (np.lib.format, "write_array"),
-    "arrays": (tree, "save_file"),
+    "arrays": (tree, "_write_arrays"),
     "index": (np, "savez"),
     "checksum": (store, "checksum"),
     "sync": (os, "fsync"),
