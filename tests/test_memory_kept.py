@@ -56,7 +56,9 @@ def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str)
         kept.append(sb3_crc.memory._keepers - outside)
         return True
 
-    model: SAC = make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20)
+    model: SAC = (
+        make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20, device="cpu")
+    )
     model.learn(3, callback=note)
     assert kept == [1, 1, 1]
     assert sb3_crc.memory._keepers == outside
