@@ -3,6 +3,7 @@
 import platform
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from stable_baselines3 import SAC
@@ -46,22 +47,24 @@ def test_pages_are_touched_once_and_given_back() -> None:
     assert afterwards < 5e6
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has these settings")
 @pytest.mark.parametrize("algorithm", ["crc", "sac", "sac_matched"])
-def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str) -> None:
-    kept = []
-    outside = sb3_crc.memory._keepers  # benchmarks of the same process keep theirs until its end
+def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    now: dict[int, int] = {}
+    glibc = SimpleNamespace(mallopt=now.__setitem__, malloc_trim=lambda pad: None)
+    monkeypatch.setattr(sb3_crc.memory, "_glibc", lambda: glibc)
+    monkeypatch.setattr(sb3_crc.memory, "_keepers", 0)  # benchmarks of the same process have theirs
+    learned_with = []
 
     def note(local_variables: object, global_variables: object) -> bool:
-        kept.append(sb3_crc.memory._keepers - outside)
+        learned_with.append(dict(now))
         return True
 
     model: SAC = (
         make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20, device="cpu")
     )
     model.learn(3, callback=note)
-    assert kept == [1, 1, 1]
-    assert sb3_crc.memory._keepers == outside
+    assert learned_with == [sb3_crc.memory.KEEPING] * 3
+    assert now == {**sb3_crc.memory.KEEPING, **sb3_crc.memory.RETURNING}
 
 
 def test_a_system_without_glibc_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
