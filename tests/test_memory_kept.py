@@ -49,6 +49,9 @@ def test_pages_are_touched_once_and_given_back() -> None:
 
 @pytest.mark.parametrize("algorithm", ["crc", "sac", "sac_matched"])
 def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model: SAC = (
+        make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20, device="cpu")
+    )
     now: dict[int, int] = {}
     glibc = SimpleNamespace(mallopt=now.__setitem__, malloc_trim=lambda pad: None)
     monkeypatch.setattr(sb3_crc.memory, "_glibc", lambda: glibc)
@@ -59,9 +62,6 @@ def test_methods_that_are_compared_learn_with_the_same_allocator(algorithm: str,
         learned_with.append(dict(now))
         return True
 
-    model: SAC = (
-        make_model() if algorithm == "crc" else STOCK[algorithm]("CnnPolicy", NoiseEnv(), buffer_size=20, device="cpu")
-    )
     model.learn(3, callback=note)
     assert learned_with == [sb3_crc.memory.KEEPING] * 3
     assert now == {**sb3_crc.memory.KEEPING, **sb3_crc.memory.RETURNING}
