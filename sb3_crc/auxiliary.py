@@ -102,7 +102,7 @@ class AuxiliaryLearner:
         )
         self.objectives = build_objectives(settings.objectives, self._encoder, get_action_dim(model.action_space))
         self.objectives.to(model.device)
-        self._reads_next = reads_next(self.objectives, model.replay_buffer, getattr(model, "n_steps", 1))
+        self._reads_next = reads_next(self.objectives, model.replay_buffer)
         self._lr_schedule = lr_schedule(settings.learning_rate)
         self._parameters = {
             "encoder": trainable_parameters(self.extractor),

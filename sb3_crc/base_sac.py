@@ -4,8 +4,8 @@ import io
 import os
 import pathlib
 from abc import abstractmethod
-from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -55,6 +55,8 @@ class BaseCRCSAC(CheckedSAC):
     _objective_weights: dict[str, float]
     _weight_tensors: dict[str, th.Tensor]
     _early_updates: EarlyUpdates
+    #: Called before the updates that follow a step, also where these are made early; learn() begins and ends without any
+    before_updates: list[Callable[[], None]]
     _env_steps: int | None = None
     _frame_channels: int | None = None
     _speedometer: Speedometer
@@ -67,6 +69,7 @@ class BaseCRCSAC(CheckedSAC):
         self._speedometer = Speedometer()
         self._collapse_alarm = CollapseAlarm()
         self._early_updates = EarlyUpdates(self)
+        self.before_updates = []
         own = {name: getattr(self, name) for name in ("replay_buffer_class", "replay_buffer_kwargs", "n_steps")}
         self._choose_replay_buffer()
         super()._setup_model()
@@ -125,6 +128,8 @@ class BaseCRCSAC(CheckedSAC):
 
     def _begin_updates(self) -> LossHistory:
         """:return: of what was made already, or of what is to come"""
+        for act in self.before_updates:
+            act()
         self.policy.set_training_mode(True)
         for name, optimizer in self._optimizers().items():
             value = self._lr_schedules[name](self._current_progress_remaining)
@@ -181,8 +186,21 @@ class BaseCRCSAC(CheckedSAC):
         freed memory until the end (:func:`~sb3_crc.memory.memory_kept`), on a GPU it looks for the fastest convolutions
         (:func:`~sb3_crc.convolutions.fastest_convolutions`).
         """
-        with fast_updates(self.device):
+        with fast_updates(self.device), self._own_values_afterwards():
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    @contextmanager
+    def _own_values_afterwards(self) -> Iterator[None]:
+        """What callbacks schedule is over with the training, however that ends."""
+        rates, weights, buffer = dict(self._lr_schedules), dict(self._objective_weights), self.replay_buffer
+        n_steps = buffer.n_steps if isinstance(buffer, FrameReplayBuffer) else 1
+        try:
+            yield
+        finally:
+            self.before_updates.clear()
+            self._lr_schedules, self._objective_weights = rates, weights
+            if isinstance(buffer, FrameReplayBuffer):
+                buffer.n_steps = n_steps
 
     def save(
         self,
@@ -292,7 +310,8 @@ class BaseCRCSAC(CheckedSAC):
         if self._n_updates % HEALTH_INTERVAL == 0:
             return self._update(views)
         intervals = self.policy_delay, self.target_update_interval, self.auxiliary_interval
-        return self._recorded(views, tuple(self._n_updates % interval == 0 for interval in intervals))
+        due = tuple(self._n_updates % interval == 0 for interval in intervals)
+        return self._recorded(views, (*due, views.has_next))  # the last changes when n_steps does
 
     def _instruments(self, views: Views) -> AbstractContextManager[dict[str, th.Tensor]]:
         if self._n_updates % HEALTH_INTERVAL != 0:
@@ -327,6 +346,7 @@ class BaseCRCSAC(CheckedSAC):
             "_weight_tensors",
             "_early_updates",
             "between_updates",
+            "before_updates",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

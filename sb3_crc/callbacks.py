@@ -277,23 +277,19 @@ class ObjectiveScheduleCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         model = _checked_crcsac(self.model, type(self).__name__)
-        self._own_rate = model._lr_schedules["encoder_learning_rate"]
         if self.encoder_learning_rate is not None:
             model._lr_schedules["encoder_learning_rate"] = self.encoder_learning_rate  # train() reads it at each call
-        self._apply(model)
+        model.before_updates.append(self._apply)
+        self._apply()
 
     def _on_step(self) -> bool:
         return True
 
-    def _on_rollout_end(self) -> None:  # right before train()
-        self._apply(_checked_crcsac(self.model, type(self).__name__))
+    def _on_rollout_end(self) -> None:  # for the log, also before there are updates
+        self._apply()
 
-    def _on_training_end(self) -> None:
+    def _apply(self) -> None:
         model = _checked_crcsac(self.model, type(self).__name__)
-        model._lr_schedules["encoder_learning_rate"] = self._own_rate
-        model._objective_weights = objective_weights(model.objectives)
-
-    def _apply(self, model: CRCSAC) -> None:
         progress = model._current_progress_remaining
         values = {name: _scheduled(name, schedule, progress) for name, schedule in self.weights.items()}
         model._objective_weights = {**model._objective_weights, **values}
@@ -325,6 +321,7 @@ class NStepScheduleCallback(BaseCallback):
             if not isinstance(number, int) or isinstance(number, bool) or number < 1:
                 raise ValueError(f"n_steps={dict(n_steps)}: {number!r} must be a whole number, at least 1")
         self.n_steps = dict(sorted(n_steps.items()))
+        self._own: int | None = None  # the buffer's, while it is scheduled
 
     def _init_callback(self) -> None:
         buffer = getattr(self.model, "replay_buffer", None)
@@ -332,12 +329,19 @@ class NStepScheduleCallback(BaseCallback):
             raise ValueError(f"NStepScheduleCallback needs a FrameReplayBuffer, the model has {type(buffer).__name__}")
 
     def _on_training_start(self) -> None:
-        self._own = self._buffer.n_steps
+        if self._own is None:  # else a stock algorithm was interrupted
+            self._own = self._buffer.n_steps
+        self._buffer.n_steps = self._own
+        if isinstance(self.model, CRCSAC):
+            self.model.before_updates.append(self._apply)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:  # right before train()
+        self._apply()
+
+    def _apply(self) -> None:
         done = 1 - self.model._current_progress_remaining
         for share, number in self.n_steps.items():
             if done >= share:
@@ -345,7 +349,8 @@ class NStepScheduleCallback(BaseCallback):
         self.logger.record("train/n_steps", self._buffer.n_steps)
 
     def _on_training_end(self) -> None:
-        self._buffer.n_steps = self._own
+        if self._own is not None:
+            self._buffer.n_steps, self._own = self._own, None
 
     @property
     def _buffer(self) -> FrameReplayBuffer:

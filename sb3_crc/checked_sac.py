@@ -16,6 +16,8 @@ LOSSES = (
     *("train/critic_loss", "train/actor_loss", "train/ent_coef_loss"),
     *(f"train/{optimizer}_gradient_norm" for optimizer in ("critic", "encoder", "actor", "ent_coef")),
 )
+#: What SB3 calls the last one of an episode; it is stored, and not the first one of the next
+TERMINAL = "the terminal observation"
 
 
 class CheckedSAC(SAC):
@@ -43,12 +45,15 @@ class CheckedSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        found = not_finite({"the reward": reward, "the observation": new_obs})
+        last = {int(env): infos[env].get("terminal_observation") for env in np.flatnonzero(dones)}  # stored in new_obs's place
+        found = not_finite({"the reward": reward, "the observation": new_obs}) or _not_finite_at_the_end(last)
         if found is None:
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
             return
         if self.on_nonfinite == "stop":
             observations = {"observation": self._last_obs, "next_observation": new_obs}
+            if found[0].startswith(TERMINAL):
+                observations["terminal_observation"] = last[found[1]]
             self._stop_at(found, {**observations, "action": buffer_action, "reward": reward}, "the environment returned it")
         self._skipped_transitions += len(dones)
         if isinstance(replay_buffer, FrameReplayBuffer):
@@ -94,3 +99,13 @@ class CheckedSAC(SAC):
         if "representation/latent_std" in means:
             self._collapse_alarm.check(means["representation/latent_std"], max(HEALTH_INTERVAL, len(history.updates)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+def _not_finite_at_the_end(observations: Mapping[int, Any]) -> tuple[str, int, float] | None:
+    """:param observations: environment -> the last one of its episode; :return: as :func:`not_finite`"""
+    for env, observation in observations.items():
+        rows = {key: [one] for key, one in observation.items()} if isinstance(observation, Mapping) else [observation]
+        found = not_finite({TERMINAL: rows})
+        if found is not None:
+            return found[0], env, found[2]
+    return None

@@ -4,7 +4,7 @@ B batch, Z latent, A action.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
@@ -15,6 +15,7 @@ from sb3_crc.base_sac import BaseCRCSAC
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory, checked_step, parameters_of
+from sb3_crc.gradients import gradients_of
 from sb3_crc.image_spaces import image_shape, image_space
 from sb3_crc.memory import largest_that_fits, named_shortage
 from sb3_crc.objectives import ObjectiveSettings, objective_weights, reads_next
@@ -212,7 +213,7 @@ class CRCSAC(BaseCRCSAC):
         super()._setup_model()
         self.policy_kwargs = own_policy_kwargs
         set_precision(self.policy, self.precision)
-        self._reads_next = reads_next(self.policy.objectives, self.replay_buffer, self.n_steps)
+        self._reads_next = reads_next(self.policy.objectives, self.replay_buffer)
 
         size = self.policy.critic.features_extractor.input_shape[1:]
         self._augment = augmented_input(self.augmentation, self.augmentation_kwargs, shape, size)
@@ -298,8 +299,8 @@ class CRCSAC(BaseCRCSAC):
         anchors, encoder = views.anchors, list(self.critic.features_extractor.parameters())
         critic_loss = self._critic_loss(views)
         latents = [anchor.latent for anchor in anchors]
-        gradients = th.autograd.grad(critic_loss, [*latents, *self.critic.head_parameters()])
-        td_gradients, head_gradients = gradients[: len(latents)], gradients[len(latents) :]
+        gradients = gradients_of([critic_loss], [*latents, *self.critic.head_parameters()])
+        td_gradients, head_gradients = cast("tuple[th.Tensor, ...]", gradients[: len(latents)]), gradients[len(latents) :]
         metrics = {"train/critic_loss": critic_loss.detach()}
         optimizer = self.policy.encoder_optimizer if self._n_updates % self.auxiliary_interval == 0 else None
         if optimizer is None or self.reencode:
@@ -368,7 +369,7 @@ class CRCSAC(BaseCRCSAC):
         actor_loss = (self._temperature() * log_prob - q_values.min(dim=1, keepdim=True).values).mean()
         metrics = {"train/actor_loss": actor_loss.detach(), "train/entropy": -log_prob.detach().mean()}
         optimizer = self.actor.optimizer
-        metrics |= self._step("actor", optimizer, th.autograd.grad(actor_loss, parameters_of(optimizer)))
+        metrics |= self._step("actor", optimizer, gradients_of([actor_loss], parameters_of(optimizer)))
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             ent_coef_loss = -(self.log_ent_coef * (log_prob.detach() + float(self.target_entropy))).mean()

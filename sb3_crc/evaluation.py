@@ -41,8 +41,8 @@ class QBiasEvalCallback(EvalCallback):
     evaluations, at each of them, and ``training_seconds`` in all.
     """
 
-    def _init_callback(self) -> None:
-        super()._init_callback()
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
         self._episodes: dict[int, list[tuple[Observation, np.ndarray, float]]] = {}
         self._biases: list[tuple[float, float]] = []
         self.evaluations_seeds: list[int] = []
@@ -160,7 +160,8 @@ def q_value_and_soft_return(
     policy, device = model.policy, model.device
     gpus = [device] if device.type == "cuda" else []
     with th.no_grad(), th.random.fork_rng(gpus):  # evaluating must not change the run's random numbers
-        taken = th.as_tensor(policy.scale_action(np.stack(actions[:1])), dtype=th.float32, device=device)
+        scaled = policy.scale_action(np.stack(actions[:1])).reshape(1, -1)
+        taken = th.as_tensor(scaled, dtype=th.float32, device=device)
         first, _ = policy.obs_to_tensor(_rows(frames, slice(1)))
         q_value = th.cat(policy.critic(first, taken)).min()
         entropies, value = [], th.zeros(())

@@ -69,6 +69,7 @@ def export_policy(
     policy = model.policy if isinstance(model, CRCSAC) else model
     target = Path(path) if Path(path).suffix else Path(path).with_suffix(".sb3crc")
     about = {"format": FORMAT, "configuration": json.dumps(_describe(policy))}
+    _read(about["configuration"], target)  # here and now, and not when the policy is needed
     if task is not None:
         about["environment"] = json.dumps({"task": task, "env_kwargs": dict(env_kwargs or {})})
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in _weights(policy).items()}
@@ -227,7 +228,7 @@ def _read(text: str, source: Path) -> dict[str, Any]:
         low, high = given["log_std_bounds"]
         if not float(low) < float(high):
             raise ValueError(f"log_std_bounds={given['log_std_bounds']}: the first must be less than the second")
-        for number in _numbers(given):
+        for number in _numbers({name: value for name, value in given.items() if not name.endswith("_space")}):
             if not abs(number) <= LARGEST:
                 raise ValueError(f"{number} is more than {LARGEST}")
         if given["activation_fn"] not in ACTIVATIONS:
@@ -246,7 +247,7 @@ def _space(about: Mapping[str, Any]) -> spaces.Space[Any]:
     if about.keys() == {"dict"}:
         return spaces.Dict({str(name): _space(one) for name, one in about["dict"].items()})
     shape, dtype = tuple(map(int, about["shape"])), np.dtype(about["dtype"])
-    if dtype not in (np.uint8, np.float32, np.float64) or min(shape, default=1) < 1 or math.prod(shape) > 100 * LARGEST:
+    if dtype.kind not in "iuf" or min(shape, default=1) < 1 or math.prod(shape) > 100 * LARGEST:
         raise ValueError(f"no space of shape {shape} and type {dtype}")
     low, high = (limit if about[name] is None else about[name] for name, limit in (("low", -np.inf), ("high", np.inf)))
     return spaces.Box(low, high, shape, dtype.type)

@@ -108,7 +108,10 @@ def checked_step(
     parameters = parameters_of(optimizer)
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
-    norm = th.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
+    present = [gradient for gradient in gradients if gradient is not None]
+    if not present:  # all of it is frozen
+        return th.zeros((), device=parameters[0].device)
+    norm = th.nn.utils.get_total_norm(present)
     if max_norm is not None:
         th.nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
     if optimizer.param_groups[0].get("fused"):  # torch's loss scaling asks the same of it

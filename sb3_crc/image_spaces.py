@@ -84,6 +84,19 @@ def split_observations(observations: Any, observation_space: spaces.Space[Any]) 
     return observations[image_key(observation_space)], th.cat(vectors, dim=1) if vectors else None
 
 
+def as_bytes(observations: Any, observation_space: spaces.Space[Any]) -> Any:
+    """
+    :param observations: a batch of images with values in [0, 255], or a mapping with such, of any type: environments need not
+        keep to their space's, and SB3 takes them by their space
+    :param observation_space: what they belong to
+    :return: the same with uint8 images
+    """
+    if isinstance(observations, Mapping):
+        key = image_key(observation_space)
+        return {**observations, key: as_bytes(observations[key], observation_space[key])}  # type: ignore[index]
+    return observations if observations.dtype == th.uint8 else observations.round().to(th.uint8)
+
+
 def _proprioception_spaces(observation_space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
     if not isinstance(observation_space, spaces.Dict):
         return {}

@@ -6,6 +6,7 @@ made while the environments simulate and draw. Where these are processes of thei
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol
 
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -29,6 +30,8 @@ class Learner(Protocol):
     train_freq: Any
     _n_updates: int
     _total_timesteps: int
+    _last_obs: Any
+    before_updates: list[Callable[[], None]]
     _vec_normalize_env: VecNormalize | None
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None: ...
@@ -53,8 +56,13 @@ class WhileStepping(VecEnvWrapper):
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Do it, then await the answer."""
-        self._work()
+        """Do it, then await the answer, also if it fails: the next step would take it for its own."""
+        try:
+            self._work()
+        except BaseException:
+            with suppress(Exception):  # Ctrl-C in a terminal ends the environments' processes too
+                self.venv.step_wait()
+            raise
         return self.venv.step_wait()
 
 
@@ -84,6 +92,13 @@ class EarlyUpdates:
         return history
 
     def _make(self) -> None:
+        try:
+            self._make_updates()
+        except BaseException:
+            self._learner._last_obs = None  # the step is lost, so a later learn() resets the environments
+            raise
+
+    def _make_updates(self) -> None:
         learner, buffer = self._learner, self._learner.replay_buffer
         self._history = None  # left by a training that was stopped
         if not isinstance(buffer, FrameReplayBuffer) or learner._vec_normalize_env is not None:
@@ -94,6 +109,8 @@ class EarlyUpdates:
             return
         wanted = learner.gradient_steps if learner.gradient_steps >= 0 else buffer.n_envs
         learner._update_current_progress_remaining(steps, learner._total_timesteps)
+        for act in learner.before_updates:
+            act()
         with buffer.one_ahead():
             while wanted > 0 and buffer.next_batch_is_there(learner.batch_size):
                 if self._history is None:

@@ -31,7 +31,7 @@ from torch import nn
 from typing_extensions import Self
 
 from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
-from sb3_crc.image_spaces import proprioception_dim, split_observations
+from sb3_crc.image_spaces import as_bytes, proprioception_dim, split_observations
 from sb3_crc.objectives import ObjectiveSettings, build_objectives
 from sb3_crc.settings import check_name
 from sb3_crc.views import View
@@ -78,6 +78,9 @@ class CRCActor(Actor):
             self.projection = latent_projection(encoder.convolution_dim, self.features_dim, encoder.latent_activation)
         inputs = self.features_dim + proprioception_dim(self.observation_space)
         self.latent_pi = _heads_mlp(inputs, -1, self.net_arch, self.activation_fn, layer_norm)
+        if not self.net_arch and inputs != self.features_dim:  # SB3's were made for the latent alone
+            self.mu = nn.Linear(inputs, get_action_dim(self.action_space))
+            self.log_std = nn.Linear(inputs, get_action_dim(self.action_space))  # type: ignore[assignment]
         for module in self.own_modules():
             module.apply(init_orthogonal)
 
@@ -91,7 +94,8 @@ class CRCActor(Actor):
         return [parameter for module in self.own_modules() for parameter in module.parameters()]
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        """:param obs: images ``(B, C, H, W)``, uint8, or a mapping with such; :return: mean and log std ``(B, A)``, and {}"""
+        """:param obs: images ``(B, C, H, W)``, 0 to 255, or a mapping with them; :return: mean, log std ``(B, A)``, and {}"""
+        obs = as_bytes(obs, self.observation_space)
         with th.no_grad():  # the encoder is not the actor's to train
             features = self.features_extractor.convolve(obs)
             if self.actor_features == "latent":
@@ -163,7 +167,8 @@ class CRCCritic(ContinuousCritic):
             self.q_networks.append(head)
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        """:param obs: images ``(B, C, H, W)``, uint8, or a mapping with such; :return: what the heads see, ``(B, Z + P)``"""
+        """:param obs: images ``(B, C, H, W)``, 0 to 255, or a mapping with them; :return: what heads see, ``(B, Z + P)``"""
+        obs = as_bytes(obs, self.observation_space)
         return _beside(features_extractor(obs), split_observations(obs, self.observation_space)[1])
 
     def q_values(self, latents: th.Tensor, actions: th.Tensor, proprioception: th.Tensor | None = None) -> th.Tensor:

@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_crc.gradients import gradients_of
 from sb3_crc.views import Views
 
 #: Share of the old value in the moving average of the gradient norms
@@ -50,7 +51,8 @@ def auxiliary_gradients(
     :param views: of one batch
     :param td_gradient: of the critic loss at the latent, ``(B, Z)``, to compare directions with
     :param gradient_norms: moving average of each objective's gradient norm at the latent, updated in place
-    :param balance: divide each objective by its moving average before weighting
+    :param balance: divide each objective by its moving average before weighting, where it has one: not if it reads the
+        features alone
     """
     leaves: list[Gradient] = [None, None]
     own: list[Gradient] = []
@@ -59,14 +61,17 @@ def auxiliary_gradients(
     for index, (name, objective) in enumerate(objectives.items()):
         loss = objective(views)
         inputs = [*views.query.leaves, *objective.parameters()]
-        gradients = th.autograd.grad(loss, inputs, allow_unused=True)
+        gradients = gradients_of([loss], inputs)
         at_latent = th.zeros_like(td_gradient) if gradients[0] is None else gradients[0]
         norm = at_latent.norm()
         old = gradient_norms[index]
         moved = th.where(old > 0, NORM_DECAY * old + (1 - NORM_DECAY) * norm, norm)
         gradient_norms[index] = th.where(norm.isfinite(), moved, old)
 
-        scale = weights[name] / gradient_norms[index].clamp(min=1e-12) if balance else weights[name]
+        scale = weights[name]
+        if balance:  # an objective that does not reach the latent has nothing to be compared by
+            known = gradient_norms[index]
+            scale = th.where(known > 0, scale / known.clamp(min=1e-12), scale)
         leaves = [_add(*pair, scale) for pair in zip(leaves, gradients[:2], strict=True)]
         own += [_add(None, gradient, scale) for gradient in gradients[2:]]
         total = total + scale * loss.detach()

@@ -42,6 +42,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from sb3_crc.augmentations import Images, center_crop
 from sb3_crc.buffers.samples import FrameSamples
 from sb3_crc.encoder import PixelEncoder, scale_pixels
+from sb3_crc.gradients import gradients_of
 from sb3_crc.image_spaces import split_observations
 
 #: What is read of a batch beside its images
@@ -116,11 +117,11 @@ class View:
         :param retain_graph: keep the encoder's graph for another call
         :return: the loss's gradient for each parameter; None where it has none
         """
-        pairs = [pair for pair in zip((self._latent, self._features), gradients, strict=True) if pair[1] is not None]
-        if not pairs:
+        if all(gradient is None for gradient in gradients):
             return (None,) * len(parameters)
-        outputs, grad_outputs = zip(*pairs, strict=True)
-        return th.autograd.grad(outputs, parameters, grad_outputs, retain_graph=retain_graph, allow_unused=True)
+        pairs = zip((self._latent, self._features), gradients, strict=True)
+        outputs, at_outputs = zip(*(pair for pair in pairs if pair[1] is not None), strict=True)
+        return gradients_of(outputs, parameters, at_outputs, retain_graph=retain_graph)
 
     def forget_encoding(self) -> None:
         """Encode anew when an online encoding is asked for next, by the weights of then."""
@@ -218,13 +219,18 @@ class Views:
         """The middle of o_t, not augmented."""
         return self._view("clean", "observations", self._middle)
 
+    @property
+    def has_next(self) -> bool:
+        """Whether o_{t+1} is another observation than o_{t+n}."""
+        batch = self._batch
+        return getattr(batch, "one_step_observations", batch.next_observations) is not batch.next_observations
+
     @cached_property
     def next(self) -> View:
         """Augmented o_{t+1}."""
         if not self._offers_next:
             raise RuntimeError("an objective that reads views.next must declare it: reads_next = True in its class")
-        one_step = getattr(self._batch, "one_step_observations", self._batch.next_observations)
-        if one_step is self._batch.next_observations:
+        if not self.has_next:
             return self.bootstrap
         return self._view("next", "one_step_observations", self._augment)
 
@@ -257,7 +263,8 @@ class Views:
         """
         passes = []
         if self._augment_query is not None:
-            passes.append(self.query.backward(leaves, parameters))
+            if any(leaf is not None for leaf in leaves):
+                passes.append(self.query.backward(leaves, parameters))
             leaves = (None, None)
         latent, features = leaves
         first = td_gradients[0] if latent is None else td_gradients[0] + latent

@@ -151,6 +151,35 @@ def test_evaluations_of_all_runs_begin_with_the_same_seeds(tmp_path: Path) -> No
     assert seeds[0] == seeds[1] == [FIRST_SEED + SEED_STEP, FIRST_SEED + 2 * SEED_STEP, FIRST_SEED + 3 * SEED_STEP]
 
 
+def test_a_second_training_goes_on_with_the_same_records(tmp_path: Path) -> None:
+    model = make_model(NoiseEnv())
+    callback = QBiasEvalCallback(NoiseEnv(), eval_freq=10, n_eval_episodes=1, verbose=0, warn=False, log_path=str(tmp_path))
+    seconds = []
+    for _ in range(2):
+        model.learn(20, callback=callback, reset_num_timesteps=False)
+        with np.load(tmp_path / "evaluations.npz") as data:
+            assert len({len(data[name]) for name in ("timesteps", "seeds", "updates", "seconds")}) == 1
+            seconds.append(float(data["training_seconds"]))
+            seeds = data["seeds"].tolist()
+    assert seeds == [FIRST_SEED + k * SEED_STEP for k in (1, 2, 3, 4)]
+    assert 0 < seconds[0] < seconds[1]
+
+
+def test_actions_may_have_several_axes() -> None:
+    class Square(NoiseEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_space = gym.spaces.Box(-1, 1, (2, 3), np.float32)
+
+        def step(self, action: Any) -> Any:
+            return super().step(action[0])
+
+    model = make_model(Square())
+    callback = QBiasEvalCallback(Square(), eval_freq=5, n_eval_episodes=1, verbose=0, warn=False)
+    model.learn(5, callback=callback, reset_num_timesteps=False)
+    assert np.isfinite(model.logger.name_to_value["eval/q_bias"])
+
+
 def test_seconds_are_those_of_training_alone(tmp_path: Path) -> None:
     model = make_model(NoiseEnv(), learning_starts=100)
     callback = QBiasEvalCallback(SeededEnv(0.1), eval_freq=5, n_eval_episodes=2, verbose=0, warn=False, log_path=str(tmp_path))

@@ -77,6 +77,38 @@ def test_images_and_vectors(tmp_path: Path) -> None:
     env.close()
 
 
+@pytest.mark.parametrize(
+    "box",
+    [
+        gym.spaces.Box(-np.finfo(np.float32).max, np.finfo(np.float32).max, (4,), np.float32),  # as Gymnasium's CartPole has
+        gym.spaces.Box(-5, 5, (4,), np.int64),
+        gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),
+    ],
+    ids=["largest", "integers", "unbounded"],
+)
+def test_vectors_of_any_bounds_and_types(tmp_path: Path, box: gym.spaces.Box) -> None:
+    class Beside(gym.ObservationWrapper[Any, Any, Any]):
+        observation_space = gym.spaces.Dict({"image": NoiseEnv().observation_space, "vector": box})
+
+        def observation(self, observation: Any) -> Any:
+            return {"image": observation, "vector": np.ones(4, box.dtype)}
+
+    model = CRCSAC("MultiInputPolicy", Beside(NoiseEnv()), buffer_size=50, policy_kwargs=POLICY_KWARGS, device="cpu")
+    policy = load_policy(export_policy(model, tmp_path / "policy"), "cpu")
+    assert policy.observation_space == model.observation_space
+    observation, _ = Beside(NoiseEnv()).reset(seed=0)
+    assert np.array_equal(
+        policy.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+    )
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
+    model = make_model(policy_kwargs={**POLICY_KWARGS, "log_std_bounds": (-1e7, 2)})
+    with pytest.raises(PolicyFileError, match="-10000000.0 is more than 1048576"):
+        export_policy(model, tmp_path / "policy.sb3crc")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_going_on_with_it(tmp_path: Path) -> None:
     model = make_model()
     path = export_policy(model, tmp_path / "policy")

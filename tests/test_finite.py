@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crc import CRCSAC
+from tests.buffers.test_multi_input import Both
 from tests.compared_models import parameters
-from tests.conftest import NoiseEnv, make_model
+from tests.conftest import POLICY_KWARGS, NoiseEnv, make_model
 
 NAN, INFINITY = float("nan"), float("inf")
 
@@ -71,6 +73,45 @@ def test_a_reward_of_nan_stops_before_it_is_stored(tmp_path: Path) -> None:
     assert saved["observation"].shape == saved["next_observation"].shape == (1, 9, 40, 40)
     assert np.isnan(saved["reward"]).all() and np.isfinite(saved["action"]).all()
     assert all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
+
+
+class Unstable(Both):
+    """Once it is told to be, an episode ends with numbers that are not finite."""
+
+    broken = False
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, _, end, info = super().step(action)
+        if self.broken and end:
+            observation["state"] = np.full((2, 2), INFINITY, np.float32)
+        return observation, reward, end, False, info
+
+
+@pytest.mark.parametrize("on_nonfinite", ["stop", "skip"])
+def test_the_last_observation_of_an_episode_is_looked_at_too(on_nonfinite: str, tmp_path: Path) -> None:
+    """By then the environment has been reset; what is stored is what it showed before."""
+    env = Unstable(NoiseEnv(channels=3))
+    model = CRCSAC(
+        "MultiInputPolicy",
+        DummyVecEnv([lambda: Both(NoiseEnv(channels=3, length=100)), lambda: env]),
+        **{"buffer_size": 200, "batch_size": 8, "learning_starts": 8, "policy_kwargs": POLICY_KWARGS, "seed": 0},
+        on_nonfinite=on_nonfinite,
+        tensorboard_log=str(tmp_path),
+    )
+    model.learn(40)
+    env.broken = True
+    if on_nonfinite == "stop":
+        message = r"the terminal observation\['state'\] of environment 1 is inf at agent step 60, with 29 rows stored: the env"
+        with pytest.raises(FloatingPointError, match=message) as error:
+            model.learn(40, reset_num_timesteps=False)
+        saved = np.load(Path(str(error.value).rpartition("saved in ")[2]) / "transition.npz")
+        assert np.isinf(saved["terminal_observation/state"]).all() and np.isfinite(saved["next_observation/state"]).all()
+    else:
+        model.learn(40, reset_num_timesteps=False)
+        assert model.logger.name_to_value["rollout/skipped_transitions"] == 4  # two ends, both environments
+        assert model.logger.name_to_value["train/skipped_updates"] == 0
+    stored = model.replay_buffer.size()
+    assert np.isfinite(model.replay_buffer.next_observations["state"][:stored]).all()
 
 
 def test_weights_of_nan_stop_before_they_act() -> None:

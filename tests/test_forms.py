@@ -11,8 +11,9 @@ from torch.nn import functional as F
 
 from sb3_crc import CRCSAC, PRESETS
 from sb3_crc.augmentations import center_crop, random_crop, random_overlay
-from sb3_crc.objectives import Consistency, Contrastive, Reconstruction
+from sb3_crc.objectives import AuxiliaryObjective, Consistency, Contrastive, Reconstruction
 from sb3_crc.objectives.reconstruction import quantize
+from sb3_crc.views import Views
 from tests.conftest import POLICY_KWARGS, make_model
 
 SHAPE = (3, 40, 40)
@@ -151,6 +152,23 @@ def test_grad_norm_balance_divides_each_objective_by_its_norm_at_the_latent() ->
     for index, name in enumerate(norms):
         moving = 0.99 * norms[name] + 0.01 * second.metrics[f"representation/{name}_gradient_norm"]
         assert model.policy.gradient_norms[index].item() == pytest.approx(moving.item(), rel=1e-5)
+
+
+class Features(AuxiliaryObjective):
+    """Asks nothing of the latent."""
+
+    def forward(self, views: Views) -> th.Tensor:
+        return views.query.features.square().mean()
+
+
+def test_an_objective_that_does_not_reach_the_latent_keeps_its_weight_in_the_balance() -> None:
+    model = make_model(balance="grad_norm", objectives={"contrastive": 0.5, f"{__name__}.Features": 0.5})
+    views = model._sample_views(16)
+    found = model._auxiliary_gradients(views, th.randn(16, 16))
+    own = th.autograd.grad(Features.forward(model.policy.objectives["Features"], views), views.query.features)[0]
+    assert th.allclose(found.leaves[1], 0.5 * own)
+    assert found.metrics["representation/loss"] < 1e3
+    assert model.policy.gradient_norms[1] == 0 < model.policy.gradient_norms[0]
 
 
 def test_the_balance_is_saved(tmp_path: Any) -> None:

@@ -2,13 +2,17 @@
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_crc import CRCSAC
-from sb3_crc.objectives import OBJECTIVES
+from sb3_crc.objectives import OBJECTIVES, AuxiliaryObjective
+from sb3_crc.views import Views
 from tests.conftest import POLICY_KWARGS, make_model
 
 
@@ -155,3 +159,42 @@ def test_the_view_table_holds() -> None:
     (bootstrap, anchor), (key_bootstrap, positive) = seen["online"][:2], seen["key"][:2]
     assert th.equal(bootstrap, key_bootstrap)
     assert not th.equal(anchor, positive)
+
+
+class Teacher(AuxiliaryObjective):
+    """A layer to train, and one that never is."""
+
+    def __init__(self, latent_dim: int, *shapes: Any):
+        super().__init__(latent_dim, *shapes)
+        self.fixed = nn.Linear(latent_dim, 8).requires_grad_(False)
+        self.student = nn.Linear(latent_dim, 8)
+
+    def forward(self, views: Views) -> th.Tensor:
+        return F.mse_loss(self.student(views.query.latent), self.fixed(views.positive.key_latent))
+
+
+@pytest.mark.parametrize("own", [{}, {"joint_update": True}, {"reencode": True}, {"max_grad_norm": 1.0}], ids=str)
+@pytest.mark.parametrize("frozen", ["teacher", "convolutions", "projection", "encoder", "actor", "heads"])
+def test_frozen_weights_stay_and_the_others_learn(frozen: str, own: dict[str, Any]) -> None:
+    model = make_model(objectives={"contrastive": 0.5, f"{__name__}.Teacher": 0.5}, policy_delay=1, **own)
+    encoder, objectives = model.policy.critic.features_extractor, model.policy.objectives
+    modules = {
+        "teacher": [objectives["Teacher"].fixed],
+        **{"convolutions": [encoder.convolutions], "projection": [encoder.projection], "encoder": [encoder]},
+        **{"actor": model.actor.own_modules(), "heads": model.policy.critic.q_networks},
+    }[frozen]
+    weights = [parameter.requires_grad_(False) for module in modules for parameter in module.parameters()]
+    before = [weight.clone() for weight in weights]
+    others = [parameter for parameter in model.policy.parameters() if parameter.requires_grad]
+    old = [parameter.detach().clone() for parameter in others]
+    model.train(gradient_steps=3, batch_size=16)
+    assert all(map(th.equal, weights, before))
+    assert not any(map(th.equal, others, old))
+    assert all(np.isfinite(value) for name, value in model.logger.name_to_value.items() if name.startswith("train/"))
+
+
+def test_a_frozen_encoder_without_objectives() -> None:
+    model = make_model(objectives={})
+    model.policy.critic.features_extractor.requires_grad_(False)
+    trained = moved(model, lambda: model.train(gradient_steps=2, batch_size=16))
+    assert trained - {"key_encoder"} == {"q_heads", "actor", "target_heads"}  # averaging equal weights rounds

@@ -8,10 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 
 from sb3_crc import CRCSAC
+from sb3_crc.callbacks import NStepScheduleCallback, ObjectiveScheduleCallback
 from tests.conftest import POLICY_KWARGS, NoiseEnv
 
 
@@ -139,3 +140,48 @@ def test_a_training_that_is_stopped_goes_on_with_whole_updates() -> None:
     before = model._n_updates
     model.train(gradient_steps=2, batch_size=8)
     assert model._n_updates == before + 2
+
+
+@pytest.mark.parametrize(
+    "callback",
+    [
+        lambda: ObjectiveScheduleCallback({"contrastive": "lin_1.0"}, encoder_learning_rate="lin_0.01"),
+        lambda: NStepScheduleCallback({0.6: 3}),
+        lambda: CallbackList([ObjectiveScheduleCallback({"contrastive": "lin_1.0"}), NStepScheduleCallback({0.6: 3})]),
+    ],
+    ids=["weights", "returns", "both"],
+)
+def test_schedules_are_those_of_the_step_that_updates_follow(callback: Callable[[], BaseCallback]) -> None:
+    models = []
+    for overlap in (False, True):
+        model, _ = trained(environments(DummyVecEnv, 1), overlap=overlap, steps=30)
+        env = environments(DummyVecEnv, 1)
+        env.seed(5)
+        model.set_env(env)
+        for _ in range(2):
+            model.learn(30, callback=callback(), reset_num_timesteps=False)
+        models.append(model)
+    assert_same(*models)
+
+
+def test_an_error_during_a_step_leaves_no_answer_behind() -> None:
+    model, _ = trained(environments(DummyVecEnv, 2), overlap=True)
+    env = environments(SubprocVecEnv, 2)
+    model.set_env(env)
+    made = model._n_updates
+
+    def fail() -> None:
+        if model._n_updates >= made + 20:
+            raise KeyboardInterrupt
+
+    model.between_updates = fail  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(200, reset_num_timesteps=False)
+    model.between_updates = lambda: None  # type: ignore[method-assign]
+    model.learn(20, reset_num_timesteps=False)
+    _, rewards, _, _ = env.step(np.array([[0.5, 0], [0.25, 0]], np.float32))
+    assert rewards.tolist() == [0.5, 0.25]
+    buffer = model.replay_buffer
+    stored = slice(buffer.pos - 5, buffer.pos)  # the reward is the action's first entry
+    assert np.allclose(buffer.rewards[stored], buffer.actions[stored, :, 0])
+    env.close()

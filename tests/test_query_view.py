@@ -112,3 +112,12 @@ def test_it_is_saved_and_bad_names_are_refused(tmp_path: Any) -> None:
         make_model(objective_augmentation="random_crp")
     with pytest.raises(ValueError, match="beta"):
         make_model(objective_augmentation="random_overlay", objective_augmentation_kwargs={"beta": 1})
+
+
+def test_where_nothing_asks_for_it_it_is_neither_drawn_nor_encoded() -> None:
+    model = make_model(**STRONG, auxiliary_interval=2)
+    drawn_names = []
+    sample = model._sample_views
+    model._sample_views = lambda size: drawn_names.append(sample(size)) or drawn_names[-1]  # type: ignore[func-returns-value]
+    model.train(gradient_steps=4, batch_size=16)
+    assert ["query" in views.drawn for views in drawn_names] == [False, True, False, True]

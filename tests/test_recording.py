@@ -110,6 +110,29 @@ def test_replayed_updates_are_those_that_python_makes(own: dict[str, Any]) -> No
         assert models[0].logger.name_to_value[name] == pytest.approx(value, rel=1e-4, abs=1e-5), name
 
 
+class Ahead(AuxiliaryObjective):
+    """Logs whether o_{t+1} is an observation of its own."""
+
+    reads_next = True
+
+    def forward(self, views: Views) -> th.Tensor:
+        same = (views.next.images == views.bootstrap.images).float().mean()
+        self.metrics = {"same": same}
+        return views.anchor.latent.square().mean()
+
+
+@pytest.mark.parametrize("record", [None, Direct()], ids=["traced", "direct"])
+def test_an_update_with_longer_returns_is_another_one(record: Any) -> None:
+    """With one step o_{t+1} is o_{t+n}, with more it is not: nothing of that shows in the shapes of a batch."""
+    model = recorded(record, objectives={f"{__name__}.Ahead": 1.0}, augmentation="center_crop")
+    same = []
+    for n_steps in (1, 3, 1, 3):
+        model.replay_buffer.n_steps = n_steps
+        model.train(gradient_steps=8, batch_size=16)
+        same.append(model.logger.name_to_value["representation/Ahead_same"])
+    assert same[0] == same[2] == 1 and max(same[1], same[3]) < 0.5
+
+
 def test_the_first_updates_are_made_as_ever_and_then_one_of_each_kind_is_recorded() -> None:
     model = recorded(policy_delay=2, target_update_interval=2)
     tracer = model._recorded._record  # type: ignore[union-attr]

@@ -91,15 +91,15 @@ def build_objectives(objectives: ObjectiveSettings, encoder: PixelEncoder, actio
     return modules
 
 
-def reads_next(objectives: nn.ModuleDict, buffer: ReplayBuffer | None, n_steps: int) -> bool:
+def reads_next(objectives: nn.ModuleDict, buffer: ReplayBuffer | None) -> bool:
     """
     :param objectives: what :func:`build_objectives` returned
     :param buffer: where batches come from
-    :param n_steps: over how many rewards it sums
     :return: whether one of the objectives reads o_{t+1}
     :raises ValueError: if it does, and the buffer returns o_{t+n} alone
     """
     readers = [name for name, objective in objectives.items() if objective.reads_next]
+    n_steps = getattr(buffer, "n_steps", 1)
     if readers and n_steps > 1 and not isinstance(buffer, FrameReplayBuffer):
         raise ValueError(
             f"objective {readers[0]!r} reads the observation one step on, which {type(buffer).__name__} does not return with "

@@ -184,3 +184,13 @@ def test_vec_normalize_normalizes_vectors() -> None:
     expected = env.normalize_obs({key: value.numpy() for key, value in raw.items()})["state"]
     assert_same(normalized["state"].numpy(), expected)
     assert not th.equal(raw["state"], normalized["state"])
+
+
+@pytest.mark.parametrize("net_arch", [[], {"pi": [], "qf": [16]}])
+def test_heads_without_hidden_layers(net_arch: Any) -> None:
+    model = make(policy_kwargs={**SETTINGS["policy_kwargs"], "net_arch": net_arch})
+    before = parameters(model)
+    model.learn(14)
+    after = parameters(model)
+    assert not any(th.equal(before[name], after[name]) for name in ("actor.mu.weight", "critic.qf0.0.weight"))
+    assert model.predict(model.env.reset())[0].shape == (1, *model.action_space.shape)

@@ -238,6 +238,20 @@ def test_a_buffer_that_does_not_keep_it_is_refused_at_construction() -> None:
         CRCSAC("CnnPolicy", StackEnv(), **settings, **kwargs)
 
 
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_what_counts_is_over_how_many_rewards_the_buffer_sums(n_steps: int) -> None:
+    """SB3 tells users of a buffer class of their own to give it ``n_steps`` themselves; one that has none sums none."""
+    settings = {**SETTINGS, "objectives": {f"{__name__}.Following": 1.0}}
+    kwargs = {"replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": n_steps, "gamma": 0.99}}
+    if n_steps == 3:
+        with pytest.raises(ValueError, match="'Following' reads the observation one step on, which NStepReplayBuffer"):
+            CRCSAC("CnnPolicy", StackEnv(), **settings, **kwargs)
+    else:
+        CRCSAC("CnnPolicy", StackEnv(), **settings, **kwargs)
+    with pytest.warns(UserWarning, match="n_steps"):
+        CRCSAC("CnnPolicy", StackEnv(), **settings, n_steps=3, replay_buffer_class=ReplayBuffer)
+
+
 # -- SB3's own SAC -----------------------------------------------------------------------------------------------------
 
 

@@ -3,10 +3,13 @@
 from typing import Any
 
 import pytest
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_crc import FrameReplayBuffer
 from sb3_crc.callbacks import NStepScheduleCallback, ObjectiveScheduleCallback
 from tests.callbacks.stock_models import stock
-from tests.conftest import make_model
+from tests.conftest import NoiseEnv, make_model
 
 
 def test_scheduled_weights_reach_the_loss() -> None:
@@ -86,3 +89,37 @@ def test_n_step_schedule_refusals() -> None:
             NStepScheduleCallback(steps)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="needs a FrameReplayBuffer, the model has ReplayBuffer"):
         stock().learn(1, callback=NStepScheduleCallback({0.5: 1}))
+
+
+class Interrupt(BaseCallback):
+    def _on_step(self) -> bool:
+        if self.n_calls == 30:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_after_an_interruption_too_the_models_own_values_hold() -> None:
+    model = make_model(n_steps=3, learning_starts=8, batch_size=4)
+    own_rate, own_weights = model._lr_schedules["encoder_learning_rate"], model._objective_weights
+    schedules = [
+        ObjectiveScheduleCallback({"contrastive": 3.0}, encoder_learning_rate=0.5),
+        NStepScheduleCallback({0.5: 1}),
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, callback=[*schedules, Interrupt()])
+    assert model.logger.name_to_value["train/n_steps"] == 1
+    assert model.replay_buffer.n_steps == 3
+    assert model._lr_schedules["encoder_learning_rate"] is own_rate and model._objective_weights == own_weights
+    model.learn(10, reset_num_timesteps=False)
+    assert model._objective_weights == own_weights
+    assert model.policy.encoder_optimizer.param_groups[0]["lr"] == 1e-3  # type: ignore[union-attr]
+
+
+def test_the_callback_of_an_interrupted_stock_algorithm_knows_the_buffers_own_number() -> None:
+    own = {"replay_buffer_class": FrameReplayBuffer, "replay_buffer_kwargs": {"n_steps": 3, "frame_channels": None}}
+    model = SAC("CnnPolicy", NoiseEnv(), buffer_size=60, learning_starts=50, **own)  # type: ignore[arg-type]
+    callback = NStepScheduleCallback({0.5: 1})
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, callback=[callback, Interrupt()])
+    model.learn(40, callback=callback)
+    assert model.replay_buffer.n_steps == 3  # type: ignore[union-attr]
