@@ -279,13 +279,10 @@ class BaseCRCSAC(CheckedSAC):
     # -- Other ways to make an update --------------------------------------------------------------------------------
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As in SB3; with ``overlap``, updates are made during the steps. A callback that ends training loses no step."""
+        """As in SB3; with ``overlap``, updates are made during the steps."""
         rollout = super().collect_rollouts(self._early_updates.around(env) if self.overlap else env, callback, *args, **kwargs)
         if not rollout.continue_training:
             self._early_updates.taken()
-            step = callback.locals  # SB3 returns before it stores this one, and a later learn() would miss it
-            names = ("replay_buffer", "buffer_actions", "new_obs", "rewards", "dones", "infos")
-            self._store_transition(*(step[name] for name in names))
         return rollout
 
     def _set_up_recording(self) -> None:

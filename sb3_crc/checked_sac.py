@@ -5,11 +5,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.sac.sac import SAC
 
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.finite import LossHistory, not_finite, save_transition
 from sb3_crc.instruments import HEALTH_INTERVAL, CollapseAlarm
+from sb3_crc.whole_rollouts import WholeRollouts
 
 #: Metrics that must stay finite, beside the objectives
 LOSSES = (
@@ -20,7 +20,7 @@ LOSSES = (
 TERMINAL = "the terminal observation"
 
 
-class CheckedSAC(SAC):
+class CheckedSAC(WholeRollouts):
     """What is checked of transitions and updates; see ``on_nonfinite`` of CRCSAC."""
 
     on_nonfinite: str

@@ -5,6 +5,8 @@ T length of an episode in agent steps, A action.
 
 import io
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -103,9 +105,30 @@ class QBiasEvalCallback(EvalCallback):
             self._write_evaluations()
 
     def _evaluate_and_save(self) -> bool:
-        with outlived(f"the best model in {self.best_model_save_path}"):
+        with self._saves_outlived():
             return super()._on_step()
-        return True
+
+    @contextmanager
+    def _saves_outlived(self) -> Iterator[None]:
+        """That the best model cannot be written ends nothing. The environment's own errors are no matter of the disk."""
+        model, attributes = self.model, vars(self.model)
+        own = {"save": attributes.pop("save")} if "save" in attributes else {}  # of AuxiliaryLossCallback
+
+        def save(*args: Any, **kwargs: Any) -> None:
+            attributes.pop("save")  # it would be saved with the model
+            attributes.update(own)
+            try:
+                with outlived(f"the best model in {self.best_model_save_path}"):
+                    model.save(*args, **kwargs)
+            finally:
+                attributes["save"] = save
+
+        attributes["save"] = save
+        try:
+            yield
+        finally:
+            attributes.pop("save")
+            attributes.update(own)
 
     def _write_evaluations(self) -> None:
         records: dict[str, list[Any]] = {

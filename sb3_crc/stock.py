@@ -24,6 +24,7 @@ from sb3_crc.encoder import PixelEncoder
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stacking import stacked_frame_channels
+from sb3_crc.whole_rollouts import WholeRollouts
 
 #: Settings that make the environment and the budget
 ENVIRONMENT = ("n_timesteps", "n_envs", "env_kwargs", "env_wrapper", "vec_env_wrapper", "frame_stack", "buffer_size")
@@ -34,7 +35,7 @@ MATCHED_POLICY = ("net_arch", "features_extractor_kwargs")
 STATES = ("n_timesteps", "n_envs", "buffer_size", "learning_starts", "gamma")
 
 
-class StockSAC(SAC):
+class StockSAC(WholeRollouts):
     """
     SB3's SAC, whose replay buffer is by default a :class:`~sb3_crc.FrameReplayBuffer`: it samples what SB3's own samples, and
     can be saved in checkpoints. What it saves loads as ``stable_baselines3.SAC`` too.

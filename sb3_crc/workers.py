@@ -1,6 +1,7 @@
 """Environments in processes of their own, which are watched: one that has died or hangs is named, and may be replaced."""
 
 import atexit
+import json
 import math
 import multiprocessing
 import signal
@@ -9,10 +10,14 @@ import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common import monitor
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnv, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs, _worker
@@ -57,8 +62,9 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
     :param start_method: as in SB3
     :param timeout: seconds in which each must answer, or :data:`START` if that is more while it is made; those in which this
         process itself is stopped do not count
-    :param restart: replace one that has died or hangs in a step by a new one: its episode ends there, truncated, and the next
-        one begins by another seed. Otherwise, and outside of steps, a :class:`WorkerError` names it
+    :param restart: replace one that has died or hangs in a step by a new one: its episode ends there, truncated, with the last
+        picture once more, and the next one begins by another seed; Monitor's file and ``info["env_steps"]`` go on. Otherwise,
+        and outside of steps, a :class:`WorkerError` names it
     :raises ValueError: if ``timeout`` is not a positive number of seconds
     :raises WorkerError: for the first environment that cannot be made, or not in time; the processes of all are ended
     """
@@ -80,6 +86,8 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.waiting = self.closed = False
         self._env_fns: list[Make] = [partial(_undisturbed, make) for make in env_fns]
         self._last: list[Any] = [None] * len(env_fns)
+        #: ``info["env_steps"]`` of each, where there is such a thing
+        self._env_steps: list[int | None] = [None] * len(env_fns)
         methods = multiprocessing.get_all_start_methods()
         self._start_method = start_method or ("forkserver" if "forkserver" in methods else "spawn")
         self.remotes: tuple[_WatchedPipe, ...] = ()
@@ -89,7 +97,7 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         atexit.register(self._at_exit)
         try:
             for index in range(len(env_fns)):
-                remote, process = self._started(index)
+                remote, process = self._started(index, self._env_fns[index])
                 self.remotes += (remote,)
                 self.processes.append(process)
             self.remotes[0].send(("get_spaces", None))
@@ -120,6 +128,7 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         observations, rewards, dones, infos, reset_infos = zip(*results, strict=True)
         self.reset_infos = list(reset_infos)
         self._last = list(observations)
+        self._env_steps = [info.get("env_steps", before) for info, before in zip(infos, self._env_steps, strict=True)]
         stacked: Any = _stack_obs(observations, self.observation_space)
         return stacked, np.stack(rewards), np.stack(dones), list(infos)
 
@@ -150,11 +159,11 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.closed = True
         atexit.unregister(self._at_exit)
 
-    def _started(self, index: int) -> "tuple[_WatchedPipe, Any]":
+    def _started(self, index: int, make: Make) -> "tuple[_WatchedPipe, Any]":
         """:return: the pipe to a new process that makes this environment, and the process"""
         context: Any = multiprocessing.get_context(self._start_method)
         remote, work_remote = context.Pipe()
-        arguments = (work_remote, remote, CloudpickleWrapper(self._env_fns[index]))
+        arguments = (work_remote, remote, CloudpickleWrapper(make))
         process = context.Process(target=_worker, args=arguments, daemon=True)
         process.start()
         work_remote.close()
@@ -166,11 +175,14 @@ class WatchedSubprocVecEnv(SubprocVecEnv):
         self.processes[index].kill()
         self.processes[index].join()
         self.remotes[index].close()
-        remote, self.processes[index] = self._started(index)
+        remote, self.processes[index] = self._started(index, partial(_continued, self._env_fns[index]))
         self.remotes = (*self.remotes[:index], remote, *self.remotes[index + 1 :])
-        remote.send(("reset", (1_000_003 * self.restarts + index, None)))
-        observation, reset_info = remote.recv()
-        info = {"TimeLimit.truncated": True, "terminal_observation": self._last[index], "restarted": True}
+        observation, reset_info = remote.ask("reset", (1_000_003 * self.restarts + index, None))
+        if self._env_steps[index] is not None:
+            remote.ask("env_method", ("set_wrapper_attr", ("env_steps", self._env_steps[index]), {}))
+        channels = remote.ask("get_attr", "frame_channels") if remote.ask("has_attr", "frame_channels") else None
+        last = _one_frame_on(self._last[index], self.observation_space, channels)
+        info = {"TimeLimit.truncated": True, "terminal_observation": last, "restarted": True}
         return observation, 0.0, True, info, reset_info
 
 
@@ -179,6 +191,30 @@ def _undisturbed(make: Make) -> gym.Env[Any, Any]:
     for signum in SIGNALS:
         signal.signal(signum, signal.SIG_IGN)
     return make()
+
+
+def _continued(make: Make) -> gym.Env[Any, Any]:
+    """:return: the environment in the place of a lost one, in a new process: Monitor goes on with its file"""
+
+    class Appended(monitor.ResultsWriter):
+        def __init__(self, *args: Any, **kwargs: Any):
+            super().__init__(*args, **{**kwargs, "override_existing": False})
+
+    monitor.ResultsWriter = Appended  # type: ignore[misc]
+    env = make()
+    if env.has_wrapper_attr("results_writer") and (writer := env.get_wrapper_attr("results_writer")) is not None:
+        with Path(writer.file_handler.name).open(encoding="utf-8") as file, suppress(ValueError, KeyError):
+            env.set_wrapper_attr("t_start", json.loads(file.readline()[1:])["t_start"])
+    return env
+
+
+def _one_frame_on(observation: Any, space: spaces.Space[Any], channels: int | None) -> Any:
+    """:return: what the observation is if the newest of its frames, of so many channels, comes once more"""
+    if isinstance(space, spaces.Dict):
+        return {key: _one_frame_on(observation[key], one, channels) for key, one in space.items()}
+    if channels is None or not is_image_space(space):
+        return observation
+    return np.concatenate([observation[channels:], observation[-channels:]])
 
 
 def _close(reference: "weakref.ref[WatchedSubprocVecEnv]") -> None:
@@ -205,6 +241,10 @@ class _WatchedPipe:
             self._pipe.send(message)
         except OSError:
             raise self._dead() from None
+
+    def ask(self, command: str, data: Any) -> Any:
+        self.send((command, data))
+        return self.recv()
 
     def send_if_alive(self, message: Any) -> None:
         self._asked = message[0]

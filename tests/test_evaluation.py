@@ -165,6 +165,40 @@ def test_a_second_training_goes_on_with_the_same_records(tmp_path: Path) -> None
     assert 0 < seconds[0] < seconds[1]
 
 
+@pytest.mark.filterwarnings("ignore:Training and eval env are not of the same type")
+def test_an_environments_own_error_is_no_failure_of_the_disk(tmp_path: Path) -> None:
+    class Missing(NoiseEnv):
+        resets = 0
+
+        def reset(self, *args: Any, **kwargs: Any) -> Any:
+            self.resets += 1
+            if self.resets > 3:
+                raise FileNotFoundError("there is no clip video3.mp4")
+            return super().reset(*args, **kwargs)
+
+    model = make_model(NoiseEnv())
+    callback = QBiasEvalCallback(
+        Missing(), eval_freq=5, n_eval_episodes=1, verbose=0, warn=False, best_model_save_path=str(tmp_path)
+    )
+    with pytest.raises(FileNotFoundError, match="there is no clip"):
+        model.learn(40, callback=callback)
+    assert (tmp_path / "best_model.zip").exists() and "save" not in vars(model)
+
+
+def test_a_best_model_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
+    (tmp_path / "best_model.zip").mkdir()
+    model = make_model(NoiseEnv())
+    callback = QBiasEvalCallback(
+        NoiseEnv(), eval_freq=5, n_eval_episodes=1, verbose=0, warn=False, best_model_save_path=str(tmp_path)
+    )
+    saved = model.save
+    model.save = lambda *args, **kwargs: (_ for _ in ()).throw(OSError(28, "No space left on device"))  # type: ignore[method-assign]
+    own = model.save
+    with pytest.warns(UserWarning, match="the best model in .* could not be written"):
+        model.learn(5, callback=callback)
+    assert model.save is own and saved is not own
+
+
 def test_actions_may_have_several_axes() -> None:
     class Square(NoiseEnv):
         def __init__(self) -> None:

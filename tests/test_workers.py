@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor, load_results
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
 
-from sb3_crc import CRCSAC, workers
+from sb3_crc import CRCSAC, make_dmc, workers
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
@@ -204,3 +206,54 @@ def test_a_training_whose_environment_failed_goes_on_to_the_same_end(tmp_path: P
             train(run, marker, how)
         assert marker.exists() and sorted(path.name for path in run.glob("0*"))[-1] == "000000000030"
         assert_equal(train(run, marker), whole)
+
+
+class Dying(gym.Wrapper[Any, Any, Any, Any]):
+    """Kills its process at the 30th step, once."""
+
+    def __init__(self, env: gym.Env[Any, Any], marker: Path):
+        super().__init__(env)
+        self.marker, self.count = marker, 0
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        if self.count == 30 and not self.marker.exists():
+            self.marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
+def mortal(folder: Path, rank: int) -> gym.Env[Any, Any]:
+    marker = folder / ("dead" if rank else "alive")
+    if rank == 0:
+        marker.touch()
+    task = make_dmc("cartpole-swingup", seed=rank, image_size=36, render_quality="fast", action_repeat=50)
+    return Monitor(Dying(task, marker), str(folder / str(rank)))
+
+
+class Infos(BaseCallback):
+    def __init__(self) -> None:
+        super().__init__()
+        self.env_steps: list[int] = []
+
+    def _on_step(self) -> bool:
+        self.env_steps += [info["env_steps"] for info in self.locals["infos"][1:] if "env_steps" in info]
+        return True
+
+
+def test_a_task_of_the_suite_is_replaced_and_its_records_go_on(tmp_path: Path) -> None:
+    env = WatchedSubprocVecEnv([partial(mortal, tmp_path, rank) for rank in range(2)], restart=True)
+    model = CRCSAC("CnnPolicy", env, seed=0, **{**SETTINGS, "buffer_size": 200})
+    infos = Infos()
+    model.learn(120, callback=infos)
+    assert env.restarts == 1
+    assert infos.env_steps == sorted(infos.env_steps) and len(infos.env_steps) == 59 and infos.env_steps[-1] == 59 * 50
+    place = int(np.flatnonzero(model.replay_buffer.dones[:60, 1] > 0)[1])
+    stored = model.replay_buffer.observations[place, 1], model.replay_buffer.next_observations[place, 1]
+    assert place == 29 and np.array_equal(stored[0][3:], stored[1][:-3]) and np.array_equal(stored[1][-3:], stored[1][-6:-3])
+    episodes = load_results(str(tmp_path))
+    files = [(tmp_path / f"{rank}.monitor.csv").read_text().splitlines() for rank in range(2)]
+    lengths = [[int(line.split(",")[1]) for line in lines[2:]] for lines in files]
+    assert lengths == [[20, 20, 20], [20, 20]]  # the lost one has no line
+    assert len(episodes) == 5 and (episodes["t"].diff().dropna() >= 0).all()
+    env.close()

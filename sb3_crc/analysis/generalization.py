@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +22,7 @@ from sb3_crc.analysis.policies import SavedPolicy
 from sb3_crc.analysis.rollouts import FOLDER, make_environment
 from sb3_crc.atomic import atomic_write
 from sb3_crc.checkpoints.store import checksum
+from sb3_crc.disk import outlived
 from sb3_crc.envs.distractions import DISTRACTIONS
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.evaluation import FIRST_SEED as FIRST_TRAINING_SEED
@@ -173,7 +176,7 @@ class GeneralizationCallback(BaseCallback):
         folder = self.folder or (Path(self.logger.dir) if self.logger.dir else None)
         if folder is None:
             return
-        with atomic_write(folder / RECORDS) as unfinished, unfinished.open("wb") as file:
+        with outlived(folder / RECORDS), atomic_write(folder / RECORDS) as unfinished, unfinished.open("wb") as file:
             arrays = {mode: np.array(returns) for mode, returns in self.returns.items()}
             np.savez(file, timesteps=np.array(self.timesteps), **arrays)  # type: ignore[arg-type]
 
@@ -190,7 +193,7 @@ def read_records(folder: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             return dict(file)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
 
 

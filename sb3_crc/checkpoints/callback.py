@@ -19,6 +19,7 @@ from sb3_crc.checkpoints.store import INDEX, CheckpointStore
 from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
 from sb3_crc.checkpoints.tree import Tree
 from sb3_crc.disk import is_of_disk, outlived
+from sb3_crc.whole_rollouts import WholeRollouts
 
 #: File in the folder of a training that has ended
 DONE = "DONE"
@@ -76,6 +77,7 @@ class TrainingCheckpoint(BaseCallback):
         self._before: tuple[FrameReplayBuffer, tuple[Any, ...]] | None = None
         self._failures = 0
         self._saved_whole = True
+        self._in_rollout = False
         self._request = StopRequest()
 
     @property
@@ -115,24 +117,45 @@ class TrainingCheckpoint(BaseCallback):
             )
         buffer = self.model.replay_buffer
         assert isinstance(buffer, FrameReplayBuffer)
+        own_size = buffer.buffer_size
         read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
+        self._warn_of_differences(checkpoint.path, own_size)
         self._whole = checkpoint.path
         set_training_state(self.model, self.locals["callback"], checkpoint.state)
         self._saved_whole = True  # unlike the one before it, perhaps, as that state has it
         self._saved_at = self.num_timesteps = self.model.num_timesteps
+        self.model._num_timesteps_at_start = self.num_timesteps  # time/fps is of this process
         for one in callback_tree(self.locals["callback"]):
             if isinstance(one, ProgressBarCallback):
                 one.pbar.update(self.num_timesteps)
         if self.verbose > 0:
             print(f"Going on from {checkpoint.path}")
 
+    def _warn_of_differences(self, path: Path, own_size: int) -> None:
+        buffer = self.model.replay_buffer
+        assert buffer is not None
+        if buffer.buffer_size != own_size:
+            warnings.warn(
+                f"the replay buffer of {path} has {buffer.buffer_size} rows: this one has as many now, and not {own_size}",
+                stacklevel=4,
+            )
+        if self.model.use_sde:
+            warnings.warn(
+                "use_sde=True: its noise is not in checkpoints, so the run will not be bit for bit the one that was stopped",
+                stacklevel=4,
+            )
+
     def _on_rollout_start(self) -> None:
+        self._in_rollout = True
         signum = self.stopped_by
         if self.model.num_timesteps - self._saved_at >= (self.every if signum is None else 1):
             self._save()
         if signum is not None:
             self.close()
             raise TrainingStopped(signum)
+
+    def _on_rollout_end(self) -> None:
+        self._in_rollout = False
 
     def _on_step(self) -> bool:
         self._stop_if_overdue()
@@ -146,7 +169,9 @@ class TrainingCheckpoint(BaseCallback):
     def _on_training_end(self) -> None:
         if self._writer is None:  # rl_zoo3 calls this once more
             return
-        if self.model.num_timesteps > self._saved_at:
+        # Stopped by a callback, SB3 does not store the last step: what it was made of is gone
+        whole = not self._in_rollout or isinstance(self.model, WholeRollouts)
+        if whole and self.model.num_timesteps > self._saved_at:
             self._save()
         at_end = self._finish_writing()
         if self._failures > 0:

@@ -15,6 +15,7 @@ import os
 import shutil
 import uuid
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -81,13 +82,23 @@ class CheckpointStore:
 
     def save(self, steps: int, state: Tree, replay: Contents) -> Path:
         """
-        Write a checkpoint, then delete those that are too many. Whatever stops this leaves the earlier ones as they were.
+        Write a checkpoint, then delete those that are too many. Whatever stops this leaves the earlier ones as they were; on a
+        disk that fails it takes its frames away again, whose place the next attempt needs.
 
         :param steps: agent steps done
         :param state: everything but the replay buffer
         :param replay: the replay buffer
         :return: its folder
         """
+        try:
+            return self._save(steps, state, replay)
+        except OSError:
+            for name in replay.frames:
+                with suppress(OSError):
+                    (self.segments / name).unlink(missing_ok=True)
+            raise
+
+    def _save(self, steps: int, state: Tree, replay: Contents) -> Path:
         self.segments.mkdir(parents=True, exist_ok=True)
         for name, frames in replay.frames.items():
             with atomic_write(self.segments / name) as unfinished, unfinished.open("wb") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from typing import Any
 
@@ -11,7 +12,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_crc.envs.rendering import RenderingUnavailable, first_frame_watched, loss_of_context_named, select_backend
+from sb3_crc.envs.rendering import (
+    RenderingUnavailable,
+    first_frame_watched,
+    loss_of_context_named,
+    mending_line,
+    select_backend,
+)
 from sb3_crc.envs.state import State, read_task, write_task
 
 LARGE_PICTURE = 480  # side of render()'s picture in pixels: all that fits the suite's 640 x 480 off-screen buffer
@@ -37,7 +44,13 @@ def load_simulator(domain: str, subtask: str, seed: int | None, *, needs_renderi
     else:  # states need no pictures, but pixels may follow in this process
         with suppress(RenderingUnavailable):
             select_backend()
-    from dm_control import suite
+    try:
+        from dm_control import suite
+    except (ImportError, AttributeError, RuntimeError) as error:
+        raise RenderingUnavailable(
+            f"MUJOCO_GL={os.environ.get('MUJOCO_GL')} asks for a back end that cannot be loaded: {error}\n"
+            f"Unset MUJOCO_GL to try other back ends, or mend this one:\n{mending_line()}"
+        ) from error
 
     return suite.load(domain, subtask, task_kwargs={"random": seed})
 

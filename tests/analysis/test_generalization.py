@@ -126,6 +126,9 @@ def test_the_callback_refuses_what_it_cannot_distract(tmp_path: Path) -> None:
 
 def test_unreadable_records_are_named(tmp_path: Path) -> None:
     assert read_records(tmp_path) == {}
+    (tmp_path / RECORDS).write_bytes(b"PK\x03\x04, and the rest is missing")
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_records(tmp_path)
     (tmp_path / RECORDS).write_bytes(b"no archive")
     with pytest.raises(ValueError, match=RECORDS):
         read_records(tmp_path)

@@ -1,11 +1,14 @@
 """Checkpoints on disk: which stay, and what a damaged one leads to."""
 
+import errno
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sb3_crc import CRCSAC
+from sb3_crc.checkpoints import store as store_module
 from sb3_crc.checkpoints.store import MANIFEST, CheckpointError, CheckpointStore
 from tests.checkpoints.runs import assert_equal, train
 
@@ -85,3 +88,27 @@ def test_a_damaged_one_takes_no_place_of_those_that_follow(whole: CRCSAC, tmp_pa
         train(tmp_path, seed=1, stop=35, every=3, keep=1)
     assert CheckpointStore(tmp_path).names() == ["000000000033"]
     assert_equal(train(tmp_path, seed=2), whole)
+
+
+def test_frames_of_a_checkpoint_that_could_not_be_written_are_taken_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise each attempt would fill the disk further, with the same frames under other names."""
+    written = store_module.write_tree
+
+    def full(tree: Any, folder: Path) -> None:
+        if monkeypatched:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(tree, folder)
+
+    monkeypatched = False
+    monkeypatch.setattr(store_module, "write_tree", full)
+    train(tmp_path, stop=15)
+    store = CheckpointStore(tmp_path)
+    needed = {path.name for path in store.segments.iterdir()}
+    monkeypatched = True
+    with pytest.warns(UserWarning, match="could not be written"):
+        train(tmp_path)
+    assert {path.name for path in store.segments.iterdir()} == needed
+    monkeypatched = False
+    assert store.newest().path.name == "000000000010"  # type: ignore[union-attr]
