@@ -1,5 +1,6 @@
 """SB3's SAC as CRCSAC needs it around the algorithm: our policy, four learning rates, counted steps, checked files."""
 
+import difflib
 import io
 import os
 import pathlib
@@ -17,6 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.sac.sac import SAC
 from typing_extensions import Self
 
 from sb3_crc.atomic import atomic_write
@@ -34,6 +36,31 @@ from sb3_crc.schedules import LearningRate, check_learning_rate, lr_schedule, se
 from sb3_crc.settings import check_name
 from sb3_crc.stacking import stacked_frame_channels
 from sb3_crc.views import Views
+
+#: Arguments of the policy that are the algorithm's to give, and what gives them
+GIVEN = {
+    **{"objectives": "objectives", "joint_update": "joint_update"},
+    **{"qf_lr_schedule": "qf_learning_rate", "encoder_lr_schedule": "encoder_learning_rate"},
+}
+
+
+def check_arguments(algorithm: type[SAC], arguments: Iterable[str], policy_kwargs: Iterable[str]) -> None:
+    """
+    :param algorithm: CRCSAC
+    :param arguments: names of those that it hands on to SB3's SAC
+    :param policy_kwargs: names of those for the policy
+    :raises TypeError: for an argument that there is not
+    :raises ValueError: for one of the policy that is an argument of the algorithm
+    """
+    known = sorted({*signature(SAC.__init__).parameters, *signature(algorithm.__init__).parameters} - {"self", "kwargs"})
+    for name in arguments:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            raise TypeError(f"{algorithm.__name__} has no argument {name!r}{hint} Known: {', '.join(known)}")
+    for name in policy_kwargs:
+        if name in GIVEN:
+            raise ValueError(f"policy_kwargs: {name} is not the policy's own, give {algorithm.__name__} {GIVEN[name]}=...")
 
 
 class BaseCRCSAC(CheckedSAC):
@@ -168,9 +195,18 @@ class BaseCRCSAC(CheckedSAC):
     ) -> tuple[int, BaseCallback]:
         if isinstance(self.replay_buffer, FrameReplayBuffer):
             self.replay_buffer.warn_if_too_large()
+            self._check_capacity(self.replay_buffer, total_timesteps + (0 if reset_num_timesteps else self.num_timesteps))
             if reset_num_timesteps or self._last_obs is None:  # SB3 resets the environments
                 self.replay_buffer.interrupt()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _check_capacity(self, buffer: FrameReplayBuffer, until: int) -> None:
+        """Before random actions fill it for nothing."""
+        capacity = buffer.buffer_size * buffer.n_envs
+        if self.batch_size > capacity and self.gradient_steps != 0 and until > self.learning_starts:
+            raise ValueError(
+                f"batch_size={self.batch_size} is more than the replay buffer holds, {capacity} transitions: raise buffer_size"
+            )
 
     def learn(
         self,

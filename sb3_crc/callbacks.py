@@ -37,7 +37,7 @@ class AuxiliaryLossCallback(BaseCallback):
     the Q network's) on the replay buffer, with an Adam and a key encoder (a moving average of the extractor) of its own. It
     needs nothing of the algorithm but its buffer and works with SAC, TD3, DDPG, TQC, DQN and QR-DQN::
 
-        model = SAC("CnnPolicy", env)
+        model = SAC("CnnPolicy", env, buffer_size=20_000)
         model.learn(100_000, callback=AuxiliaryLossCallback())
 
     With ``share_features_extractor=True`` the actor sees through the trained extractor too. Without (SB3's default), the

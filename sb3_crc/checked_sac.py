@@ -71,15 +71,22 @@ class CheckedSAC(WholeRollouts):
             f"what led to it is saved in {target}"
         )
 
-    def _check_stored(self, batch_size: int) -> None:
-        """SB3 would fill the batch with copies, which are false negatives of the contrastive loss."""
+    def _has_batch(self, batch_size: int) -> bool:
+        """
+        SB3 would fill the batch with copies, which are false negatives of the contrastive loss.
+
+        :param batch_size: B
+        :return: whether so many transitions are stored. A model that was loaded without its replay buffer acts until they are
+        :raises ValueError: if they are not, and it has learned nothing yet, or the buffer cannot hold them
+        """
         assert self.replay_buffer is not None
-        stored = self.replay_buffer.size() * self.replay_buffer.n_envs
-        if batch_size > stored:
+        stored, capacity = (n * self.replay_buffer.n_envs for n in (self.replay_buffer.size(), self.replay_buffer.buffer_size))
+        if batch_size > stored and (self._n_updates == 0 or batch_size > capacity):
             raise ValueError(
                 f"batch_size={batch_size} is more than the {stored} transitions that are stored: raise learning_starts "
                 f"({self.learning_starts}) or buffer_size ({self.buffer_size}), or load a replay buffer"
             )
+        return batch_size <= stored
 
     def _record(self, history: LossHistory, batch_size: int) -> None:
         """Log the means over one call of :meth:`train`."""

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_crc.augmentations import AUGMENTATIONS, ImageSize, augmented_input, takes_size
-from sb3_crc.base_sac import BaseCRCSAC
+from sb3_crc.base_sac import BaseCRCSAC, check_arguments
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.convolutions import PRECISIONS, set_precision
 from sb3_crc.finite import LossHistory, checked_step, parameters_of
@@ -137,6 +137,7 @@ class CRCSAC(BaseCRCSAC):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
+        check_arguments(type(self), kwargs, policy_kwargs or {})
         super().__init__(
             # A class, since for the name SB3 would send users of Dict observations to a policy that is not ours
             self._get_policy_from_name(policy) if isinstance(policy, str) else policy,  # type: ignore[arg-type]
@@ -239,7 +240,8 @@ class CRCSAC(BaseCRCSAC):
         :param gradient_steps: number of updates, to which the first call adds ``initial_updates``
         :param batch_size: transitions per update
         """
-        self._check_stored(batch_size)
+        if not self._has_batch(batch_size):
+            return  # a model that was loaded without its replay buffer acts until a batch is stored
         if self._n_updates == 0:
             gradient_steps += self.initial_updates
         history = self._begin_updates()

@@ -35,6 +35,7 @@ class Learner(Protocol):
     _vec_normalize_env: VecNormalize | None
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None: ...
+    def _has_batch(self, batch_size: int) -> bool: ...
     def _begin_updates(self) -> LossHistory: ...
     def _make_update(self, history: LossHistory, batch_size: int) -> None: ...
 
@@ -106,6 +107,8 @@ class EarlyUpdates:
         steps = learner.num_timesteps + buffer.n_envs
         every_step = learner.train_freq == TrainFreq(1, TrainFrequencyUnit.STEP)
         if not every_step or learner._n_updates == 0 or steps <= learner.learning_starts:
+            return
+        if not learner._has_batch(learner.batch_size):
             return
         wanted = learner.gradient_steps if learner.gradient_steps >= 0 else buffer.n_envs
         learner._update_current_progress_remaining(steps, learner._total_timesteps)

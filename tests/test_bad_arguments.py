@@ -9,7 +9,7 @@ import pytest
 import torch as th
 
 from sb3_crc import CRCSAC
-from tests.conftest import NoiseEnv, construct, make_model
+from tests.conftest import POLICY_KWARGS, NoiseEnv, construct, make_model
 
 NAN, INFINITY = float("nan"), float("inf")
 
@@ -184,3 +184,30 @@ def test_a_buffer_smaller_than_the_batch_is_refused_when_it_trains(tmp_path: Pat
         model.learn(21)
     model.save(tmp_path / "model.zip")
     CRCSAC.load(tmp_path / "model.zip", buffer_size=1).predict(np.zeros((9, 40, 40), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("name", "instead"),
+    [
+        ("objectives", "objectives"),
+        ("joint_update", "joint_update"),
+        ("qf_lr_schedule", "qf_learning_rate"),
+        ("encoder_lr_schedule", "encoder_learning_rate"),
+    ],
+)
+def test_what_the_algorithm_gives_the_policy_is_refused_among_its_own(name: str, instead: str) -> None:
+    with pytest.raises(ValueError, match=rf"policy_kwargs: {name} is not the policy's own, give CRCSAC {instead}=\.\.\."):
+        CRCSAC("CnnPolicy", NoiseEnv(), policy_kwargs={name: {}})
+
+
+def test_an_argument_that_there_is_not_is_named_with_the_nearest() -> None:
+    with pytest.raises(TypeError, match="CRCSAC has no argument 'learning_rates'; did you mean 'learning_rate'"):
+        CRCSAC("CnnPolicy", NoiseEnv(), learning_rates=1e-3)
+
+
+def test_a_buffer_that_never_holds_a_batch_is_refused_before_it_is_filled() -> None:
+    model = CRCSAC("CnnPolicy", NoiseEnv(), batch_size=64, buffer_size=50, learning_starts=100, policy_kwargs=POLICY_KWARGS)
+    with pytest.raises(ValueError, match="batch_size=64 is more than the replay buffer holds, 50 transitions: raise buffer_size"):
+        model.learn(120)
+    assert model.replay_buffer.size() == 0
+    assert model.learn(20).replay_buffer.size() == 20  # random actions alone

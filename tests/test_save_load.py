@@ -200,3 +200,18 @@ def test_a_replay_buffer_is_saved_and_loaded(tmp_path: Path) -> None:
         np.random.seed(3)
         batches.append(m.replay_buffer.sample(16))
     assert all(map(th.equal, batches[0][:5], batches[1][:5]))
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_a_model_without_its_buffer_acts_until_a_batch_is_stored(overlap: bool, tmp_path: Path) -> None:
+    model = make_model(overlap=overlap).learn(5, reset_num_timesteps=False)
+    model.save(tmp_path / "model")
+    loaded = CRCSAC.load(tmp_path / "model", env=NoiseEnv())
+    updates = loaded._n_updates
+    loaded.learn(15, reset_num_timesteps=False)
+    assert loaded._n_updates == updates > 0
+    loaded.learn(5, reset_num_timesteps=False)
+    assert loaded._n_updates == updates + 5
+    fresh = CRCSAC("CnnPolicy", NoiseEnv(), batch_size=16, buffer_size=50, learning_starts=5, policy_kwargs=POLICY_KWARGS)
+    with pytest.raises(ValueError, match="batch_size=16 is more than the 6 transitions that are stored"):
+        fresh.learn(20)

@@ -35,7 +35,7 @@ FOLDER = "analysis"
 FORMAT = 1
 LONGEST_EPISODE = 10_000
 #: Settings by which rl_zoo3 puts wrappers around an environment
-WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
+WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize")
 
 
 @dataclass(frozen=True)

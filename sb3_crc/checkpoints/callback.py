@@ -16,7 +16,7 @@ from sb3_crc.checkpoints.lock import RunLock
 from sb3_crc.checkpoints.logs import distant_monitors, endure, set_distant_monitors
 from sb3_crc.checkpoints.signals import StopRequest, TrainingStopped
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
-from sb3_crc.checkpoints.training import callback_tree, set_training_state, training_state
+from sb3_crc.checkpoints.training import callback_tree, other_arguments, set_training_state, training_state
 from sb3_crc.checkpoints.tree import Tree
 from sb3_crc.disk import is_of_disk, outlived
 from sb3_crc.whole_rollouts import WholeRollouts
@@ -120,6 +120,12 @@ class TrainingCheckpoint(BaseCallback):
         own_size = buffer.buffer_size
         read_contents(buffer, self.store.segments, checkpoint.path / INDEX)
         self._warn_of_differences(checkpoint.path, own_size)
+        if others := other_arguments(self.model, checkpoint.state):
+            warnings.warn(
+                f"{checkpoint.path} is of a training with {'; '.join(others)}: its weights, replay buffer and random numbers "
+                "go on here. Another training needs another folder",
+                stacklevel=2,
+            )
         self._whole = checkpoint.path
         set_training_state(self.model, self.locals["callback"], checkpoint.state)
         self._saved_whole = True  # unlike the one before it, perhaps, as that state has it
@@ -128,7 +134,9 @@ class TrainingCheckpoint(BaseCallback):
         for one in callback_tree(self.locals["callback"]):
             if isinstance(one, ProgressBarCallback):
                 one.pbar.update(self.num_timesteps)
-        if self.verbose > 0:
+        if self.num_timesteps >= self.model._total_timesteps:
+            warnings.warn(f"{checkpoint.path} is of a training that has ended: there is nothing left to train", stacklevel=2)
+        elif self.verbose > 0:
             print(f"Going on from {checkpoint.path}")
 
     def _warn_of_differences(self, path: Path, own_size: int) -> None:

@@ -31,6 +31,11 @@ COUNTERS = (
     "_skipped_updates",
     "_skipped_transitions",
 )
+#: Arguments of an algorithm that change nothing of what a training comes to, or that are told of elsewhere
+INCIDENTAL = (
+    *("verbose", "tensorboard_log", "device", "stats_window_size"),
+    *("overlap", "compile", "replay_device", "buffer_size"),
+)
 #: Of a callback: what every callback has of the training, and what only describes the present moment
 NOT_STATE = ("locals", "globals", "verbose")
 
@@ -45,6 +50,7 @@ def training_state(model: OffPolicyAlgorithm, callback: BaseCallback) -> Tree:
     assert model.env is not None
     return {
         "random": random_states(),
+        "arguments": copied(plain_arguments(model)),
         "networks": copied({name: recursive_getattr(model, name).state_dict() for name in state_dicts}),
         "variables": copied({name: recursive_getattr(model, name) for name in variables}),
         "counters": {name: copied(getattr(model, name)) for name in COUNTERS if hasattr(model, name)},
@@ -55,6 +61,20 @@ def training_state(model: OffPolicyAlgorithm, callback: BaseCallback) -> Tree:
         "log": log_state(model.logger, model.env),
         "callbacks": [callback_state(one) for one in callback_tree(callback)],
     }
+
+
+def plain_arguments(model: OffPolicyAlgorithm) -> dict[str, Tree]:
+    """:return: what the model was made with, as far as it is plain data"""
+    names = {name for cls in type(model).__mro__ if issubclass(cls, OffPolicyAlgorithm) for name in signature(cls).parameters}
+    found = {name: getattr(model, name, None) for name in sorted(names - {*INCIDENTAL})}
+    return {name: value for name, value in found.items() if is_plain(value)}
+
+
+def other_arguments(model: OffPolicyAlgorithm, state: Tree) -> list[str]:
+    """:return: for each argument that differs from the saved training's, in words what both are"""
+    saved, own = state.get("arguments", {}), copied(plain_arguments(model))
+    differing = [name for name in saved if name in own and repr(saved[name]) != repr(own[name])]
+    return [f"{name}={saved[name]!r}, not {own[name]!r}" for name in differing]
 
 
 def set_training_state(model: OffPolicyAlgorithm, callback: BaseCallback, state: Tree) -> None:

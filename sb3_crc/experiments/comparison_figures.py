@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sb3_crc.experiments.comparison_summary import count, machines, summary, write_rows
+from sb3_crc.experiments.pairs import Pair, compare_by_task, compare_pairs, own_matrices, ranges
 from sb3_crc.experiments.scores import Scores, final_means, one_protocol
 from sb3_crc.experiments.statistics import (
     HIGHEST_RETURN,
     NOT_RESOLVED,
     REPS,
     Curve,
-    Difference,
     Estimate,
+    ScoreMatrices,
     aggregate,
     curve,
-    differences,
     profile,
-    score_matrices,
     training_runs,
 )
 
@@ -61,12 +60,17 @@ def draw_comparison(
     final = one_protocol(scores.final, allow_mixed=allow_mixed)
     current = scores.table[scores.table["policy"] == "current"]
     one_protocol(current.assign(first_seed=0), allow_mixed=allow_mixed)  # each of a run's evaluations has its own first seed
-    matrices = score_matrices(final_means(final))
-    compared = differences(matrices.scores, baseline, reps=reps) if baseline in matrices.scores else []
+    means = final_means(final)
+    matrices, not_aggregated = own_matrices(means)
+    own = {method: of.scores[method] for method, of in matrices.items()}
+    compared, not_compared = compare_pairs(means, baseline, reps=reps)
+    by_task, not_by_task = compare_by_task(means, baseline, reps=reps)
     styles = {method: _style(number) for number, method in enumerate(methods)}
-    notes = {"Runs without a score": list(map(str, scores.missing)), "Not in tables and profile": list(matrices.dropped)}
-    if not matrices.scores:
-        notes["Not in tables and profile"].append("all: no task and seed has a final score of every method")
+    notes = {
+        "Runs without a score": list(map(str, scores.missing)),
+        "Not in final returns and profile": not_aggregated,
+        f"Not compared with {baseline}": list(dict.fromkeys([*not_by_task, *not_compared])),
+    }
 
     folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {}
@@ -79,18 +83,19 @@ def draw_comparison(
     if seconds.methods:
         figures["wall_time.png"] = _curves_figure(seconds.methods, styles, HOURS)
     if compared:
-        figures["improvement.png"] = _improvement_figure(compared, styles, len(matrices.seeds))
-    if matrices.scores:
-        shares = profile(matrices.scores, np.linspace(0, HIGHEST_RETURN, 101), reps=reps)
-        figures["profile.png"] = _profile_figure(shares, styles)
-    notes["Figures left out"] = [f"{name}: {_why_not(name, len(matrices.scores))}" for name in FIGURES if name not in figures]
+        figures["improvement.png"] = _improvement_figure(compared, styles)
+    if own:
+        shares = profile(own, np.linspace(0, HIGHEST_RETURN, 101), reps=reps)
+        figures["profile.png"] = _profile_figure(shares, styles, matrices)
+    scored = means["method"].nunique()
+    notes["Figures left out"] = [f"{name}: {_why_not(name, scored)}" for name in FIGURES if name not in figures]
     for name in FIGURES:
         (folder / name).unlink(missing_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=DOTS_PER_INCH)
 
-    aggregates = aggregate(matrices.scores, reps=reps)
-    text = summary(matrices, aggregates, compared, baseline, final, notes)
+    aggregates = aggregate(own, reps=reps)
+    text = summary(matrices, aggregates, compared, by_task, baseline, final, notes)
     (folder / "summary.md").write_text(text, encoding="utf-8")
     write_rows(folder / "summary.csv", matrices, aggregates, compared)
     return [folder / name for name in (*figures, "summary.md", "summary.csv")]
@@ -200,13 +205,14 @@ def _tasks_figure(table: "pd.DataFrame", styles: Mapping[str, Mapping[str, Any]]
     return figure
 
 
-def _improvement_figure(compared: Sequence[Difference], styles: Mapping[str, Mapping[str, Any]], seeds: int) -> Any:
+def _improvement_figure(compared: Sequence[Pair], styles: Mapping[str, Mapping[str, Any]]) -> Any:
     from matplotlib.ticker import MaxNLocator
 
-    figure = _new_figure(1.4 + 0.4 * len(compared))
+    figure = _new_figure(1.4 + 0.5 * len(compared))
     left, right = figure.subplots(1, 2, sharey=True)
-    baseline = compared[0].baseline
-    for row, one in enumerate(compared):
+    baseline = compared[0].difference.baseline
+    for row, pair in enumerate(compared):
+        one = pair.difference
         _point(left, one.probability, row, styles[one.method], one.resolved)
         _point(right, one.iqm, row, styles[one.method], one.resolved)
         text = f"{one.iqm.value:+.0f}" if one.resolved else NOT_RESOLVED
@@ -217,14 +223,20 @@ def _improvement_figure(compared: Sequence[Difference], styles: Mapping[str, Map
     right.margins(x=0.12)
     right.xaxis.set_major_locator(MaxNLocator(5))
     left.set_ylim(len(compared) - 0.5, -0.6)
-    left.set_yticks(range(len(compared)), [one.method for one in compared])
+    left.set_yticks(range(len(compared)), [_on(one.difference.method, one.seeds, len(one.tasks), "\n") for one in compared])
     left.set_xlabel(f"P(method > {baseline})")
     right.set_xlabel(f"IQM of {RETURN} minus that of {baseline}")
     for axes in (left, right):
         axes.grid(alpha=0.3, axis="x")
-    intervals = "95 % intervals; hollow: not resolved" if seeds > 1 else "no interval"
-    figure.suptitle(f"Final policies against {baseline}, {count(seeds, 'seed')}, {intervals}", fontsize=11)
+    banded = any(len(one.seeds) > 1 for one in compared)
+    intervals = "95 % intervals; hollow: not resolved" if banded else "no interval"
+    figure.suptitle(f"Final policies against {baseline}, {intervals}", fontsize=11)
     return figure
+
+
+def _on(method: str, seeds: Sequence[int], tasks: int, between: str = ", ") -> str:
+    """The method, and on what it is judged."""
+    return f"{method}{between}{count(tasks, 'task')}, seed{'s' * (len(seeds) != 1)} {ranges(seeds)}"
 
 
 def _point(axes: Any, estimate: Estimate, row: int, style: Mapping[str, Any], filled: bool) -> None:
@@ -245,12 +257,13 @@ def _point(axes: Any, estimate: Estimate, row: int, style: Mapping[str, Any], fi
     )
 
 
-def _profile_figure(profiles: Mapping[str, Curve], styles: Mapping[str, Mapping[str, Any]]) -> Any:
-    labels = {method: f"{method}, {count(shown.seeds * shown.tasks, 'run')}" for method, shown in profiles.items()}
+def _profile_figure(
+    profiles: Mapping[str, Curve], styles: Mapping[str, Mapping[str, Any]], matrices: Mapping[str, ScoreMatrices]
+) -> Any:
+    labels = {method: _on(method, matrices[method].seeds, shown.tasks) for method, shown in profiles.items()}
     figure, axes = _draw_all(profiles, styles, labels)
-    one = next(iter(profiles.values()))
-    banded = ", with 95 % intervals" if one.interval is not None else ""
-    axes.set_title(f"Performance profile: {count(one.seeds, 'seed')}, {count(one.tasks, 'task')}{banded}", fontsize=11)
+    banded = ", with 95 % intervals" if any(one.interval is not None for one in profiles.values()) else ""
+    axes.set_title(f"Performance profile{banded}", fontsize=11)
     axes.set_xlabel("final return x")
     axes.set_ylabel("share of runs with a return above x")
     axes.set_xlim(0, HIGHEST_RETURN)
@@ -261,8 +274,8 @@ def _profile_figure(profiles: Mapping[str, Curve], styles: Mapping[str, Mapping[
 def _why_not(name: str, scored: int) -> str:
     if name == "wall_time.png":
         return "no run has seconds of training at its evaluations"
-    if name == "improvement.png" and scored == 1:
-        return "there is only one method"
-    if name in {"improvement.png", "profile.png"}:
-        return "no task and seed has a final score of every method"
+    if name == "improvement.png":
+        return "there is only one method" if scored == 1 else "no method has a task and seed in common with the baseline"
+    if name == "profile.png":
+        return "no task has a final score of every method"
     return "no run has evaluations during training that can be shown"

@@ -5,8 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_crc.experiments.pairs import Pair
 from sb3_crc.experiments.scores import PROTOCOL
-from sb3_crc.experiments.statistics import NOT_RESOLVED, ONE_SEED, STATISTICS, Difference, Estimate, ScoreMatrices
+from sb3_crc.experiments.statistics import ENOUGH_SEEDS, NOT_RESOLVED, ONE_SEED, STATISTICS, Estimate, ScoreMatrices
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,45 +33,61 @@ def machines(current: "pd.DataFrame") -> list[str]:
 
 def about(matrices: ScoreMatrices, names: bool = True) -> str:
     """:param names: of the tasks, or only how many; :return: what is compared"""
-    if not matrices.scores:
-        return "No final scores to compare."
     tasks = ", ".join(matrices.tasks) if names else count(len(matrices.tasks), "task")
     return f"{tasks}; {'seeds' if len(matrices.seeds) > 1 else 'seed'} {', '.join(map(str, matrices.seeds))}"
 
 
 def summary(
-    matrices: ScoreMatrices,
+    matrices: Mapping[str, ScoreMatrices],
     aggregates: Mapping[str, Mapping[str, Estimate]],
-    compared: Sequence[Difference],
+    compared: Sequence[Pair],
+    by_task: Sequence[Pair],
     baseline: str,
     final: "pd.DataFrame",
     notes: Mapping[str, Sequence[str]],
 ) -> str:
     """
-    :param matrices: final scores
+    :param matrices: final scores of each method, on the tasks that all have
     :param aggregates: method -> statistic -> its estimate
     :param compared: each method with the baseline
+    :param by_task: the same on each task by itself
     :param baseline: with which they are compared
     :param final: rows of final policies
     :param notes: title -> entries of a list
     :return: ``summary.md``
     """
-    lines = ["# Comparison", "", about(matrices), ""]
-    if matrices.scores:
+    lines = ["# Comparison", ""]
+    if final.empty:
+        lines += ["No final scores to compare.", ""]
+    else:
         protocol = [f"{column} {', '.join(map(str, final[column].dropna().unique()))}" for column in PROTOCOL]
-        lines += [f"Final policies: {'; '.join(protocol)}.", "", "## Final returns", ""]
-        rows = [(method, *(found[name].text() for name in STATISTICS)) for method, found in aggregates.items()]
-        lines += [*markdown(("method", *STATISTICS), rows), ""]
+        lines += [f"Final policies: {'; '.join(protocol)}.", ""]
+    if matrices:
+        tasks = ", ".join(next(iter(matrices.values())).tasks)
+        lines += ["## Final returns", "", f"{tasks}: each method with all its own seeds.", ""]
+        rows = [
+            (method, _seeds(matrices[method].seeds), *(found[name].text() for name in STATISTICS))
+            for method, found in aggregates.items()
+        ]
+        lines += [*markdown(("method", "seeds", *STATISTICS), rows), ""]
     if compared:
-        lines += [f"## Against {baseline}", "", *difference_table(compared)]
-        lines += ["", f"'{NOT_RESOLVED}': the interval of the difference includes 0, or there is none.", ""]
-    if len(matrices.seeds) > 1:
-        lines += ["In parentheses: 95 % intervals, stratified bootstrap over seeds; differences paired by seed.", ""]
-    elif matrices.seeds:
-        lines += [f"{ONE_SEED.capitalize()}.", ""]
-    if 1 < len(matrices.seeds) < FEW_SEEDS:
+        lines += [f"## Against {baseline}", "", *difference_table(compared), ""]
+    if len({one.tasks for one in by_task}) > 1:
+        lines += ["On each task:", "", *difference_table(by_task), ""]
+    if compared or by_task:
         lines += [
-            f"With {len(matrices.seeds)} seeds these intervals are too narrow: on one task, two equal methods come out as "
+            f"Each method on the tasks and seeds that it and {baseline} both have. '{NOT_RESOLVED}': the interval of the "
+            f"difference includes 0, or there are fewer than {ENOUGH_SEEDS} seeds.",
+            "",
+        ]
+    seeds = [len(own.seeds) for own in matrices.values()] + [len(pair.seeds) for pair in (*compared, *by_task)]
+    if max(seeds, default=0) > 1:
+        lines += ["In parentheses: 95 % intervals, stratified bootstrap over seeds; differences paired by seed.", ""]
+    elif seeds:
+        lines += [f"{ONE_SEED.capitalize()}.", ""]
+    if any(1 < number < FEW_SEEDS for number in seeds):
+        lines += [
+            f"With fewer than {FEW_SEEDS} seeds these intervals are too narrow: on one task, two equal methods come out as "
             "different in about 50 % of comparisons with 2 seeds, 26 % with 3, 10 % with 5 and 7 % with 10, instead of 5 %.",
             "",
         ]
@@ -84,18 +101,24 @@ def listed(title: str, entries: Sequence[str]) -> list[str]:
     return [f"## {title}", "", *(f"- {entry}" for entry in entries), ""] if entries else []
 
 
-def difference_table(compared: Sequence[Difference], places: Sequence[tuple[str, str]] = ()) -> list[str]:
+def difference_table(compared: Sequence[Pair]) -> list[str]:
     """
     :param compared: methods with one baseline, at least one
-    :param places: tasks and seeds of each, where they are not the same for all
     :return: lines of a table
     """
-    header = ["method", "difference of IQMs", "verdict", f"P(method > {compared[0].baseline})"]
-    rows = [[one.method, one.iqm.text("+.0f"), one.verdict, one.probability.text(".2f")] for one in compared]
-    if places:
-        header[1:1] = ["tasks", "seeds"]
-        rows = [[method, *place, *figures] for (method, *figures), place in zip(rows, places, strict=True)]
+    tasks = "task" if all(len(one.tasks) == 1 for one in compared) else "tasks"
+    baseline = compared[0].difference.baseline
+    header = ["method", tasks, "seeds", "difference of IQMs", "verdict", f"P(method > {baseline})"]
+    rows = []
+    for one in compared:
+        found = one.difference
+        figures = [found.iqm.text("+.0f"), found.verdict, found.probability.text(".2f")]
+        rows.append([found.method, ", ".join(one.tasks), _seeds(one.seeds), *figures])
     return markdown(header, rows)
+
+
+def _seeds(seeds: Iterable[int]) -> str:
+    return ", ".join(map(str, seeds))
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], marks: Sequence[str] | None = None) -> list[str]:
@@ -106,19 +129,23 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], marks: Sequen
 
 def write_rows(
     path: Path,
-    matrices: ScoreMatrices,
+    matrices: Mapping[str, ScoreMatrices],
     aggregates: Mapping[str, Mapping[str, Estimate]],
-    compared: Sequence[Difference],
+    compared: Sequence[Pair],
 ) -> None:
     """:param path: of ``summary.csv``, see :func:`summary` for the rest"""
-    found = [(method, "", name, one, "") for method, own in aggregates.items() for name, one in own.items()]
-    for one in compared:
-        found.append((one.method, one.baseline, "difference of IQM", one.iqm, one.verdict))
-        found.append((one.method, one.baseline, "probability of improvement", one.probability, ""))
+    rows = [
+        (method, "", name, one, len(matrices[method].seeds), len(matrices[method].tasks), "")
+        for method, own in aggregates.items()
+        for name, one in own.items()
+    ]
+    for pair in compared:
+        one, counts = pair.difference, (len(pair.seeds), len(pair.tasks))
+        rows.append((one.method, one.baseline, "difference of IQM", one.iqm, *counts, one.verdict))
+        rows.append((one.method, one.baseline, "probability of improvement", one.probability, *counts, ""))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(SUMMARY_COLUMNS)
-        for method, baseline, name, estimate, verdict in found:
+        for method, baseline, name, estimate, *rest in rows:
             low, high = ("", "") if estimate.interval is None else estimate.interval
-            counts = len(matrices.seeds), len(matrices.tasks)
-            writer.writerow([method, baseline, name, estimate.value, low, high, *counts, verdict])
+            writer.writerow([method, baseline, name, estimate.value, low, high, *rest])

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_crc.experiments.comparison_summary import difference_table, markdown
+from sb3_crc.experiments.pairs import compare_by_task
 from sb3_crc.experiments.published import SIX_TASKS, read_published
 from sb3_crc.experiments.runs import read_json
-from sb3_crc.experiments.scores import final_means, one_protocol, read_scores
-from sb3_crc.experiments.statistics import HIGHEST_RETURN, NOT_RESOLVED, aggregate, differences, score_matrices
+from sb3_crc.experiments.scores import BETWEEN, final_means, one_protocol, read_scores
+from sb3_crc.experiments.statistics import ENOUGH_SEEDS, HIGHEST_RETURN, NOT_RESOLVED, aggregate
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
@@ -30,16 +31,16 @@ BEST: dict[str, str] = {
     "walker-walk": "Simoun",
 }
 BUDGET = 100_000
-#: Seeds from which a bootstrap says something about a mean, and its samples
-ENOUGH_SEEDS, SAMPLES = 3, 10_000
+#: Of the bootstrap of a mean
+SAMPLES = 10_000
 
 
-def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | None = None, trials: Path | None = None) -> str:
+def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | None = None, trials: Sequence[Path] = ()) -> str:
     """
     :param sources: CSV files of scores, or folders that contain runs
     :param baseline: method with which the others are compared
     :param landmarks: file of ``sb3-crc landmarks``
-    :param trials: table of the trials that led to the settings
+    :param trials: tables of the trials that led to the settings
     :return: Markdown. The same files give the same page
     :raises FileNotFoundError: if a file does not exist
     :raises ValueError: if there are no final scores, episodes are missing, or they do not belong together
@@ -48,20 +49,20 @@ def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | No
     final = scores.final
     if final.empty:
         raise ValueError(f"there is no score of a final policy in {', '.join(map(str, sources))}")
-    means = final_means(one_protocol(final))
+    means = final_means(one_protocol(final, remedy=""))
     check_name("baseline", baseline, list(dict.fromkeys(means["method"])))
     lines = ["# Results", ""]
     lines += _paragraph(
         "Made by `sb3-crc results` from raw files alone; do not edit. Every figure is the return of the FINAL policy after "
-        "exactly the budget, random first steps and repeated actions included: mean action, fresh episodes, whose seeds are "
-        "the same for all methods and were used by no training and no other evaluation. All runs are shown."
+        "exactly the budget, random first steps and repeated actions included: mean action, episodes whose seeds are the same "
+        "for all methods and were used by no training; trials before used them too. All runs are shown."
     )
     measured = {} if landmarks is None else read_json(landmarks)["returns"]
     for task in dict.fromkeys(means["task"]):
         lines += _task(task, means[means["task"] == task], measured.get(task, {}))
     lines += _compared(means, baseline)
     lines += _conditions(final)
-    if trials is not None:
+    if trials:
         lines += _trials(trials)
     absent = [f"- {missing}" for missing in scores.missing]
     absent += [f"- no run on {task}" for task in SIX_TASKS if task not in set(means["task"])]
@@ -116,20 +117,17 @@ def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[flo
 
 
 def _compared(means: "pd.DataFrame", baseline: str) -> Iterator[str]:
-    found, places = [], []
-    for method in dict.fromkeys(means["method"]):
-        pair = score_matrices(means[means["method"].isin([baseline, method])])
-        if method == baseline or not pair.scores:
-            continue
-        found += differences(pair.scores, baseline)
-        places.append((", ".join(pair.tasks), ", ".join(map(str, pair.seeds))))
+    found, left_out = compare_by_task(means, baseline)
     if not found:
         return
-    yield from [f"## Against {baseline}", "", *difference_table(found, places), ""]
+    yield from [f"## Against {baseline}", "", *difference_table(found), ""]
     yield from _paragraph(
-        "Each method on the tasks and seeds that it and the baseline both have. "
-        f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0."
+        "A row for each task, with all seeds that the method and the baseline both have on it. "
+        f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0, or there are fewer than "
+        f"{ENOUGH_SEEDS} seeds."
     )
+    if left_out:
+        yield from ["In no row:", "", *(f"- {one}" for one in left_out), ""]
 
 
 def _conditions(final: "pd.DataFrame") -> Iterator[str]:
@@ -139,22 +137,28 @@ def _conditions(final: "pd.DataFrame") -> Iterator[str]:
         about += [f"{rows['episodes'].iloc[0]} episodes", f"from seed {rows['first_seed'].iloc[0]}"]
         yield f"- {task}: {', '.join(about)}"
     for column, title in (("machine", "machines"), ("versions", "versions"), ("git_revision", "revisions")):
-        yield f"- {title}: {'; '.join(sorted(map(str, final[column].dropna().unique()))) or 'not recorded'}"
+        values = {one for value in final[column].dropna().unique() for one in str(value).split(BETWEEN)}
+        yield f"- {title}: {BETWEEN.join(sorted(values)) or 'not recorded'}"
     yield ""
 
 
-def _trials(path: Path) -> Iterator[str]:
+def _trials(paths: Sequence[Path]) -> Iterator[str]:
     import pandas as pd
 
-    try:
-        counts = pd.read_csv(path)["algo"].value_counts(sort=False)
-    except (ValueError, KeyError) as error:
-        raise ValueError(f"{path} is no table of trials: {error}") from error
-    yield from ["## Trials before", ""]
+    counted = []
+    for path in paths:
+        try:
+            found = pd.read_csv(path)
+            counts = found["algo"].value_counts(sort=False)
+            seeds = sorted(set(found["seed"])) if "seed" in found else []
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{path} is no table of trials: {error}") from error
+        with_seeds = f", with seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}" if seeds else ""
+        counted.append(f"{', '.join(f'{number} of {name}' for name, number in counts.items())}{with_seeds} ({path.name})")
+    yield from ["## Trials", ""]
     yield from _paragraph(
-        f"The settings were found by trials on cartpole-swingup ({path.name}): "
-        f"{', '.join(f'{number} of {name}' for name, number in counts.items())}; none of any other method, which have the "
-        "settings that `rad` was tuned for."
+        f"Trials on cartpole-swingup, before these runs and beside: {'; '.join(counted)}; none of any other method: they have "
+        "the settings that `rad` was tuned for."
     )
 
 

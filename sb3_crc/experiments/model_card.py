@@ -174,12 +174,13 @@ def _training(run: Run) -> list[str]:
         f"```yaml\n{settings}```",
         f"```console\npython train.py --algo {run.preset} --env {run.arguments['env']} {flags}\n```",
     ]
-    if made := run.provenance:
-        versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
-        machine = made["machine"]
-        device = machine["gpu"] or f"{machine['processor']}, {machine['threads']} thread(s)"
-        revision = f", revision {made['git_revision']}" if made["git_revision"] else ""
-        paragraphs.append(f"Trained on {made['time'][:10]} on {device}, with {versions}{revision}.")
+    if made := run.distinct("versions"):
+        versions = ", then ".join(", ".join(f"{name} {version}" for name, version in one.items()) for one in made)
+        machines = [one["gpu"] or f"{one['processor']}, {one['threads']} thread(s)" for one in run.distinct("machine")]
+        revisions = ", then ".join(run.distinct("git_revision"))
+        revision = f", revision {revisions}" if revisions else ""
+        device = ", then ".join(dict.fromkeys(machines))
+        paragraphs.append(f"Trained on {run.distinct('time')[0][:10]} on {device}, with {versions}{revision}.")
     else:
         paragraphs.append("Machine and versions of the training were not recorded.")
     return paragraphs

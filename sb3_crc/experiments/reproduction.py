@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_crc.experiments.scores import final_means, read_scores
+from sb3_crc.experiments.scores import final_means, one_protocol, read_scores
 
 
 def compare_with(committed: Path, reproduced: Path) -> dict[str, Any]:
@@ -15,17 +15,22 @@ def compare_with(committed: Path, reproduced: Path) -> dict[str, Any]:
     :return: ``method``, ``task``, ``committed`` and ``reproduced`` returns by seed, and the 95 % ``interval`` in which the
         mean of the reproduced seeds is to be expected if nothing has changed (Student's t); None with one committed seed
     :raises ValueError: if one has no final score, or the other none of the same
+    :raises MixedProtocols: if the two were measured in different ways, or runs of one of them were
     """
+    import pandas as pd
     from scipy.stats import t
 
-    found = final_means(read_scores([reproduced]).final)
+    new_rows, old_rows = read_scores([reproduced]).final, read_scores([committed]).final
+    found = final_means(new_rows)
     if len(found[["method", "task"]].drop_duplicates()) != 1:
         raise ValueError(f"{reproduced} must hold final scores of one method on one task")
     method, task = found[["method", "task"]].iloc[0]
-    before = final_means(read_scores([committed]).final)
-    before = before[(before["method"] == method) & (before["task"] == task)]
-    if before.empty:
+    old_rows = old_rows[(old_rows["method"] == method) & (old_rows["task"] == task)]
+    if old_rows.empty:
         raise ValueError(f"{committed} has no final score of {method} on {task}")
+    sides = [old_rows.assign(method="committed"), new_rows.assign(method="reproduced")]
+    one_protocol(pd.concat(sides, ignore_index=True), remedy="")
+    before = final_means(old_rows)
     old, new = before["return"].to_numpy(float), found["return"].to_numpy(float)
     interval = None
     if len(old) > 1:

@@ -6,7 +6,7 @@
         checkpoints/DONE              training has ended
         <env>/args.yml, config.yml    flags and settings
         <env>.zip                     the final policy, once training has ended
-        provenance.json               machine, versions, revision of its training
+        provenance.json               machine, versions, revision of its training, and of each time that it went on
         final.json                    what the final policy was worth: see final.py
     <anything>/spec.json              of runs that a comparison made: see specs.py
     <anything>/failure.json           why the last attempt at it ended early
@@ -109,20 +109,34 @@ class Run:
 
     @property
     def model(self) -> Path:
-        """The final policy; missing until training has ended."""
+        """The final policy; missing until training has ended, or was interrupted."""
         assert self._described is not None
         return self.folder / f"{self._described.name}.zip"
 
     @property
     def status(self) -> str:
-        """finished, unevaluated (``sb3-crc evaluate`` was not run), failed, or unfinished: killed, stopped or running."""
+        """finished, unevaluated (``sb3-crc evaluate`` was not run), failed, or unfinished: see :attr:`has_ended`."""
         if (self.folder / FINAL).exists():
             return "finished"
         if self.spec_folder is not None and (self.spec_folder / FAILURE).exists():
             return "failed"
+        return "unevaluated" if self.has_ended else "unfinished"
+
+    @property
+    def agent_steps(self) -> int | None:
+        """That the policy in :attr:`model` has seen; None: there is none, or it cannot be read."""
+        try:
+            with zipfile.ZipFile(self.model) as file:
+                return int(json.loads(file.read("data"))["num_timesteps"])
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            return None
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the final policy is there and has seen exactly the budget; rl_zoo3 saves one after an interruption too."""
         checkpoints = self.folder / CHECKPOINTS
-        ended = self.model.exists() and (not checkpoints.is_dir() or (checkpoints / DONE).exists())
-        return "unevaluated" if ended else "unfinished"
+        whole = not checkpoints.is_dir() or (checkpoints / DONE).exists()
+        return whole and self.agent_steps == self.budget // self.action_repeat
 
     @property
     def final(self) -> dict[str, Any] | None:
@@ -132,9 +146,15 @@ class Run:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Of its training; empty if it was not recorded."""
+        """Of its training's beginning, and ``resumed``: of each time that it went on; empty if it was not recorded."""
         path = self.folder / PROVENANCE
         return read_json(path) if path.exists() else {}
+
+    def distinct(self, name: str) -> list[Any]:
+        """:param name: of an entry of :attr:`provenance`; :return: what it was, each value once, in the order of time"""
+        recorded = self.provenance
+        values = [one.get(name) for one in (recorded, *recorded.get("resumed", []))]
+        return [value for place, value in enumerate(values) if value is not None and value not in values[:place]]
 
     @property
     def evaluations(self) -> dict[str, np.ndarray] | None:
@@ -224,6 +244,13 @@ def read_evaluations(path: Path) -> dict[str, np.ndarray]:
     if not {"timesteps", "results"} <= found.keys():
         raise ValueError(f"{path} holds no evaluations: there are only {', '.join(found) or 'no arrays'} in it")
     return found
+
+
+def add_provenance(made: dict[str, Any], folder: Path) -> None:
+    """:param made: machine, versions, revision; :param folder: of a run that goes on, whose file keeps the earlier ones"""
+    path = folder / PROVENANCE
+    recorded = read_json(path) if path.exists() else {}
+    write_json({**recorded, "resumed": [*recorded.get("resumed", []), made]}, path)
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:

@@ -39,6 +39,10 @@ COLUMNS: dict[str, str] = {
 }
 #: What must be equal for the final policies of two runs of one task to stand in one table
 PROTOCOL = ("budget", "episodes", "first_seed", "action_repeat", "render_quality")
+#: Stands between machines, versions or revisions of a run that went on with others
+BETWEEN = "; "
+#: Columns that name one episode of one evaluation of a run
+EPISODE = ("method", "task", "seed", "policy", "budget", "environment_steps", "episode", "run")
 _WHOLE = {"first_seed": "Int64", "updates": "Int64"}  # pandas' integers that may be missing
 
 
@@ -84,7 +88,7 @@ def read_scores(sources: Iterable[Path]) -> Scores:
     :param sources: CSV files of :func:`write_scores`, runs, or folders that contain runs
     :return: everything in them; a run that is found twice counts once
     :raises FileNotFoundError: if one does not exist
-    :raises ValueError: if a file cannot be read, naming it
+    :raises ValueError: if a file cannot be read, naming it, or two sources differ in the return of one episode of a run
     """
     import pandas as pd
 
@@ -100,7 +104,8 @@ def read_scores(sources: Iterable[Path]) -> Scores:
             missing.append(Missing(run.method, run.task, run.seed, run.status))
     missing += _not_begun(folders)
     table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(COLUMNS))
-    table = table.drop_duplicates(["method", "task", "seed", "policy", "budget", "environment_steps", "episode", "run"])
+    _check_agreement(tables)
+    table = table.drop_duplicates(list(EPISODE))
     return Scores(table, tuple([*missing, *_absent(table, missing)]))
 
 
@@ -111,7 +116,6 @@ def run_scores(run: Run) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    described = run.provenance
     states = run.env_kwargs.get("observation") == "state"
     common = {
         "method": run.method,
@@ -121,9 +125,9 @@ def run_scores(run: Run) -> "pd.DataFrame":
         "budget": run.budget,
         "action_repeat": run.action_repeat,
         "render_quality": "none" if states else run.env_kwargs.get("render_quality", "benchmark"),
-        "machine": one_line(described.get("machine")),
-        "versions": one_line(described.get("versions")),
-        "git_revision": described.get("git_revision"),
+        "machine": recorded(run, "machine"),
+        "versions": recorded(run, "versions"),
+        "git_revision": recorded(run, "git_revision"),
         "run": str(run.folder),
     }
     rows = [common | row for row in (*_current(run), *_final(run))]
@@ -139,10 +143,13 @@ def write_scores(scores: Scores, path: Path) -> None:
     scores.table.to_csv(path, index=False)
 
 
-def one_protocol(table: "pd.DataFrame", *, allow_mixed: bool = False) -> "pd.DataFrame":
+def one_protocol(
+    table: "pd.DataFrame", *, allow_mixed: bool = False, remedy: str = "; --allow-mixed puts them into one table all the same"
+) -> "pd.DataFrame":
     """
     :param table: rows of final policies
     :param allow_mixed: let different ones pass
+    :param remedy: what the error says at its end
     :return: ``table``
     :raises MixedProtocols: if rows of one task differ in any of :data:`PROTOCOL`, naming which and of which runs. States have
         no pictures, so their render quality fits every other
@@ -156,8 +163,7 @@ def one_protocol(table: "pd.DataFrame", *, allow_mixed: bool = False) -> "pd.Dat
             if len(values) > 1:
                 found = "; ".join(f"{value} ({methods})" for value, methods in values.items())
                 raise MixedProtocols(
-                    f"{task}: {column} differs: {found}. Scores of different protocols do not compare; "
-                    "--allow-mixed puts them into one table all the same"
+                    f"{task}: {column} differs: {found}. Scores of different protocols do not compare{remedy}"
                 )
     return table
 
@@ -232,6 +238,24 @@ def _absent(table: "pd.DataFrame", known: Sequence[Missing]) -> list[Missing]:
     return absent
 
 
+def _check_agreement(tables: Sequence["pd.DataFrame"]) -> None:
+    """:raises ValueError: if two of them have different returns for one episode: one of the two is out of date"""
+    import pandas as pd
+
+    if len(tables) < 2:
+        return
+    keys = list(EPISODE)
+    each = pd.concat([table.drop_duplicates(keys) for table in tables], ignore_index=True)
+    for key, returns in each[each.duplicated(keys, keep=False)].groupby(keys, dropna=False, sort=False)["return"]:
+        lowest, highest = returns.min(), returns.max()
+        if highest - lowest > 1e-6 * max(1.0, abs(highest)):
+            *_, policy, _, steps, episode, run = key
+            raise ValueError(
+                f"{run}: episode {episode} of its {policy} policy after {steps} environment steps has a return of "
+                f"{lowest:.3f} in one source, of {highest:.3f} in another: one of the two is out of date, leave it out"
+            )
+
+
 def _read_csv(path: Path) -> "pd.DataFrame":
     import pandas as pd
 
@@ -243,6 +267,11 @@ def _read_csv(path: Path) -> "pd.DataFrame":
     if lacking := [column for column in COLUMNS if column not in table]:
         raise ValueError(f"{path} is no table of scores: it has no column {', '.join(lacking)}")
     return table
+
+
+def recorded(run: Run, name: str) -> str | None:
+    """:param name: of an entry of its provenance; :return: what it was in the run's parts; None: nothing was recorded"""
+    return BETWEEN.join(one if isinstance(one, str) else one_line(one) or "" for one in run.distinct(name)) or None
 
 
 def one_line(content: Mapping[str, Any] | None) -> str | None:

@@ -25,12 +25,19 @@ from stable_baselines3 import SAC
 from sb3_crc.configurations import configuration_file, read_settings, shipped, with_overrides
 from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.envs.tasks import default_action_repeat, environment_id, split_task
+from sb3_crc.evaluation import FIRST_SEED as FIRST_EVALUATION
+from sb3_crc.experiments.final import FIRST_SEED as FIRST_FINAL
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
 from sb3_crc.stock import STOCK
 
 #: Settings of a configuration that are rl_zoo3's, not the algorithm's
 ZOO_SETTINGS = {"n_timesteps", "env_kwargs", "n_envs", "callback"}
+#: Seeds that no training may have: the first, the last (None: there is none), and of what
+EVALUATION_SEEDS: tuple[tuple[int, int | None, str], ...] = (
+    (FIRST_FINAL, FIRST_FINAL + 99, "evaluations of final policies"),
+    (FIRST_EVALUATION, None, "evaluations during training, of analyses and of trials"),
+)
 #: Key of a sweep -> of which type it must be, and that in words
 SWEEP_KEYS: dict[str, tuple[Any, str]] = {
     "tasks": (list, "a list of domain-task"),
@@ -64,8 +71,8 @@ class RunSpec:
     :param eval_every: environment steps between two evaluations of the current policy
     :param eval_episodes: of each of them, and of the final policy
     :param settings: of rl_zoo3 for this environment, complete
-    :raises ValueError: if steps are no multiple of the action repeat, the seed is negative (rl_zoo3 would draw one), or a
-        setting does not exist or cannot work
+    :raises ValueError: if steps are no multiple of the action repeat, or the budget none of a rollout; if the seed is negative
+        (rl_zoo3 would draw one) or an evaluation's (:data:`EVALUATION_SEEDS`), or a setting does not exist or cannot work
     """
 
     method: str
@@ -94,10 +101,38 @@ class RunSpec:
                 f"{self.method} on {self.task}: {self.env_steps} environment steps are {self.agent_steps} agent steps; with "
                 f"learning_starts={learning_starts} nothing would be learned"
             )
+        self._check_rollouts()
+        self._check_seeds()
         algorithm = CRCSAC if self.preset in PRESETS else SAC
         known = {*inspect.signature(SAC.__init__).parameters, *inspect.signature(algorithm.__init__).parameters}
         for name in self.settings:
             check_name(f"{self.method}: setting", name, sorted((known | ZOO_SETTINGS) - {"self", "env", "kwargs"}))
+
+    def _check_rollouts(self) -> None:
+        """Training ends where a rollout does, and only a policy after exactly the budget is scored."""
+        where, train_freq = f"{self.method} on {self.task}", self.settings.get("train_freq", 1)
+        frequency, unit = train_freq if isinstance(train_freq, list | tuple) else (train_freq, "step")
+        n_envs = self.settings.get("n_envs", 1)
+        if unit != "step":
+            raise ValueError(f"{where}: train_freq={train_freq!r} would not end after exactly the budget; it must count steps")
+        for name, value in (("train_freq", frequency), ("n_envs", n_envs)):
+            if type(value) is not int or value < 1:
+                raise ValueError(f"{where}: {name}={value!r} must be a whole number, at least 1")
+        if self.agent_steps % (frequency * n_envs) != 0:
+            raise ValueError(
+                f"{where}: {self.env_steps} environment steps are {self.agent_steps} agent steps, no multiple of "
+                f"n_envs={n_envs} times train_freq={frequency}; training would not end after exactly the budget"
+            )
+
+    def _check_seeds(self) -> None:
+        """Environment k of a training has its seed + k."""
+        seeds = range(self.seed, self.seed + self.settings.get("n_envs", 1))
+        for first, last, what in EVALUATION_SEEDS:
+            if seeds[-1] >= first and (last is None or seeds[0] <= last):
+                kept = f"{first} and above" if last is None else f"{first} to {last}"
+                raise ValueError(
+                    f"{self.method} on {self.task}: seed={self.seed} meets those of {what}, {kept}: choose another"
+                )
 
     @property
     def action_repeat(self) -> int:

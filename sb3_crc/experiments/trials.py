@@ -12,6 +12,8 @@ from sb3_crc.atomic import atomic_write
 from sb3_crc.experiments.final import final_returns
 from sb3_crc.experiments.runs import Run
 
+#: Of the environment: settings are not chosen on the episodes of final scores (sb3_crc.experiments.final)
+FIRST_SEED = 40_000
 FIELDS = (
     "trial",
     "algo",
@@ -56,7 +58,7 @@ def record_trials(runs: Sequence[Path], table: Path, *, episodes: int = 10, note
 
     :param runs: folders, ``<logs>/<algo>/<env>_<number>`` of rl_zoo3
     :param table: CSV file, made if it is missing
-    :param episodes: fresh ones on which the final policy of a finished run is evaluated; 0: none
+    :param episodes: fresh ones, from :data:`FIRST_SEED`, for the final policy of a run that has ended; 0: none
     :param note: written beside them
     :return: the new rows
     :raises FileNotFoundError: if a folder is no run
@@ -66,8 +68,8 @@ def record_trials(runs: Sequence[Path], table: Path, *, episodes: int = 10, note
     rows = []
     for run in map(Run, runs):
         row = read_trial(run) | {"note": note}
-        if episodes > 0 and run.model.exists():
-            returns = final_returns(run, episodes=episodes)
+        if episodes > 0 and run.has_ended:
+            returns = final_returns(run, episodes=episodes, seed=FIRST_SEED)
             row["final_mean"] = round(float(np.mean(returns)), 1)
             row["final_std"] = round(float(np.std(returns, ddof=1)), 1) if len(returns) > 1 else ""
             row["final_returns"] = " ".join(f"{value:.0f}" for value in returns)

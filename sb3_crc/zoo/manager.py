@@ -27,12 +27,12 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_crc.analysis.films import film
 from sb3_crc.checkpoints.callback import TrainingCheckpoint
 from sb3_crc.configurations import configuration_file, settings_for, shipped
-from sb3_crc.disk import is_of_disk
+from sb3_crc.disk import is_of_disk, outlived
 from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.envs.tasks import NAMESPACE
 from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.experiments.provenance import provenance
-from sb3_crc.experiments.runs import PROVENANCE, write_json
+from sb3_crc.experiments.runs import PROVENANCE, add_provenance, write_json
 from sb3_crc.presets import PRESETS
 from sb3_crc.stock import STOCK
 from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
@@ -124,6 +124,9 @@ class CRCExperimentManager(ExperimentManager):
         model.set_logger(self._make_logger(model))
         if self.plan.run is None:
             write_json(provenance(), Path(self.save_path) / PROVENANCE)
+        else:
+            with outlived(self.plan.run / PROVENANCE):
+                add_provenance(provenance(), self.plan.run)
         if self.plan.checkpoint_every is None:
             super().learn(model)
             return

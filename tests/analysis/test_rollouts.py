@@ -118,7 +118,9 @@ def test_an_environment_without_physics_and_one_of_another_shape(tmp_path: Path)
     assert np.array_equal(again.observations[:10], rollout.observations[:10])
 
 
-@pytest.mark.parametrize(("name", "value"), [("env_wrapper", ["a.Wrapper"]), ("frame_stack", 4), ("vec_env_wrapper", "a.B")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("env_wrapper", ["a.Wrapper"]), ("frame_stack", 4), ("vec_env_wrapper", "a.B"), ("normalize", True)]
+)
 def test_an_environment_that_rl_zoo3_has_wrapped_is_not_taken_for_another(tmp_path: Path, name: str, value: Any) -> None:
     run = Run(make_run(tmp_path, "rad", train=0))
     (config,) = run.folder.glob("*/config.yml")

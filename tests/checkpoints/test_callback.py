@@ -1,5 +1,6 @@
 """TrainingCheckpoint beside what else happens in a training."""
 
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -107,3 +108,24 @@ def test_what_does_not_go_on_as_asked_is_warned_of(tmp_path: Path) -> None:
         else:
             with pytest.warns(UserWarning, match="use_sde=True: its noise is not in checkpoints"):
                 sde.learn(steps, callback=checkpoint)
+
+
+def test_the_folder_of_another_training_is_told_of(tmp_path: Path) -> None:
+    train(tmp_path, stop=25)
+    model = CRCSAC("CnnPolicy", cartpole(0), seed=1, **{**SETTINGS, "batch_size": 8}, reward_scale=0.5)
+    message = r"000000000020 is of a training with batch_size=16, not 8; reward_scale=1.0, not 0.5; seed=0, not 1: its weights"
+    with pytest.warns(UserWarning, match=message):
+        model.learn(STEPS, callback=[TrainingCheckpoint(tmp_path), Stop(None)])
+
+
+def test_nothing_is_left_to_train_is_said(tmp_path: Path) -> None:
+    train(tmp_path)
+    with pytest.warns(UserWarning, match="000000000060 is of a training that has ended: there is nothing left to train"):
+        train(tmp_path)
+
+
+def test_the_same_training_goes_on_without_a_word(tmp_path: Path) -> None:
+    train(tmp_path, stop=25)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(tmp_path)

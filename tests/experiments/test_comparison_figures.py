@@ -47,27 +47,43 @@ def draw(scores: Scores, folder: Path, **options: object) -> tuple[set[str], str
 
 
 def test_everything_is_written_and_what_is_missing_is_listed(tmp_path: Path) -> None:
-    scores = scores_of({"crc": 800, "rad": 600, "sac": 601})
+    scores = scores_of({"crc": 800, "rad": 600, "sac": 601}, seeds=4)
     table = scores.table[scores.table["run"] != "rad/walker-walk/2"]
     scores = Scores(table, (Missing("rad", "walker-walk", 2, "failed"),))
     written, summary = draw(scores, tmp_path / "new", baseline="rad")
     assert written == {*FIGURES, "summary.md", "summary.csv"}
     assert "- rad on walker-walk, seed 2: failed" in summary
-    assert "- seed 2: no rad on walker-walk" in summary
-    assert "With 2 seeds these intervals are too narrow" in summary
-    crc, sac = (next(line for line in summary.splitlines() if line.startswith(f"| {name} | +")) for name in ("crc", "sac"))
+    assert (
+        "- crc against rad on all tasks: seed 2: no rad on walker-walk" in summary
+        and "- rad, seed 2: not on walker-walk" in summary
+    )
+    assert "these intervals are too narrow" in summary
+    both = "cartpole-swingup, walker-walk | 0, 1, 3 | +"
+    crc, sac = (
+        next(line for line in summary.splitlines() if line.startswith(f"| {name} | {both}")) for name in ("crc", "sac")
+    )
     assert "| better | 1.00" in crc and "not resolved" not in crc
-    assert "| crc | 801 (800 to 802) | 801" in summary
+    assert "| crc | 0, 1, 2, 3 | 802 (801 to 803) | 802" in summary and "| rad | 0, 1, 3 | 602 (" in summary
+    assert "| crc | cartpole-swingup | 0, 1, 2, 3 | +200 (" in summary and "| crc | walker-walk | 0, 1, 3 | +200 (" in summary
     with (tmp_path / "new" / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     (row,) = (row for row in rows if row["method"] == "sac" and row["statistic"] == "difference of IQM")
-    assert (row["baseline"], float(row["value"]), row["seeds"], row["tasks"]) == ("rad", pytest.approx(1), "2", "2")
+    assert (row["baseline"], float(row["value"]), row["seeds"], row["tasks"]) == ("rad", pytest.approx(1), "3", "2")
     assert sac.endswith("|")
 
 
 def test_equal_methods_are_not_resolved(tmp_path: Path) -> None:
     _, summary = draw(scores_of({"crc": 500, "rad": 500}), tmp_path)
-    assert "| rad | +0 (+0 to +0) | not resolved | 0.50" in summary  # against the first
+    assert "| rad | cartpole-swingup, walker-walk | 0, 1, 2 | +0 (+0 to +0) | not resolved | 0.50" in summary  # the first
+
+
+def test_two_seeds_give_no_verdict(tmp_path: Path) -> None:
+    written, summary = draw(scores_of({"crc": 800, "rad": 600}, seeds=2), tmp_path)
+    rad = next(
+        line for line in summary.splitlines() if line.startswith("| rad | cartpole-swingup, walker-walk | 0, 1 | -200 (")
+    )
+    assert "| not resolved (2 seeds) | 0.00 (" in rad and not {"better", "worse"} & {*rad.split()}
+    assert "improvement.png" in written
 
 
 def test_one_seed_gives_lines_without_bands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,8 +123,8 @@ def test_runs_that_have_not_ended_give_curves(tmp_path: Path) -> None:
 def test_a_method_may_be_called_anything(tmp_path: Path) -> None:
     _, summary = draw(scores_of({"crc": 500, "a|b": 500}), tmp_path)
     tables = [line for line in summary.splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in tables} == {5, 6}  # of four columns, and of five
-    assert sum(line.startswith("| a\\|b |") for line in tables) == 2
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in tables} == {7}  # of six columns
+    assert sum(line.startswith("| a\\|b |") for line in tables) == 4  # final returns, compared, and on each of two tasks
 
 
 def test_an_evaluation_with_a_gap_is_refused(tmp_path: Path) -> None:

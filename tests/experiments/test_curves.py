@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
+from sb3_crc.experiments.runs import SPEC, write_json
 from tests.experiments.test_report import make_run
 
 
@@ -60,6 +61,25 @@ def test_a_run_knows_its_action_repeat(tmp_path: Path, drawn: list[matplotlib.fi
     (runs[0] / "evaluations.npz").write_bytes(b"PK\3\4 half")
     done = CliRunner().invoke(app, [*command, str(runs[0])])
     assert done.exit_code == 2 and "evaluations.npz cannot be read" in done.stderr
+
+
+def test_runs_of_a_comparison_are_grouped_by_method(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:
+    runs = [make_run(tmp_path / name, "crc", seed) for name, seed in (("a", 0), ("b", 0), ("a", 1))]
+    for run, method in zip(runs, ("C+R", "C", "C+R"), strict=True):
+        write_json({"method": method}, run.parent.parent / SPEC)
+    arguments = ["curve", *map(str, runs), "--output", str(tmp_path / "curve.png")]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    labels = {line.get_label() for line in drawn[0].axes[0].lines}
+    assert {"C+R, 2 seeds", "C, 1 seed"} <= labels and not any(label.startswith("crc") for label in labels)
+
+
+def test_several_tasks_are_no_seeds_of_one(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / "a", "crc", 0), make_run(tmp_path / "b", "crc", 1)]
+    (arguments,) = runs[1].glob("*/args.yml")
+    arguments.write_text(arguments.read_text().replace("cartpole-swingup", "cartpole-balance"))
+    done = CliRunner().invoke(app, ["curve", *map(str, runs), "--output", str(tmp_path / "curve.png")])
+    assert done.exit_code == 2 and "several tasks, cartpole-balance, cartpole-swingup" in " ".join(done.stderr.split())
+    assert not (tmp_path / "curve.png").exists()
 
 
 def test_one_run_shows_its_episodes_range(tmp_path: Path, drawn: list[matplotlib.figure.Figure]) -> None:

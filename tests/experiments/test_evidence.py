@@ -40,7 +40,7 @@ def test_the_committed_page_is_what_the_raw_files_give(monkeypatch: pytest.Monke
         [results / "laptop" / "final"],
         baseline="crc",
         landmarks=results / "landmarks.json",
-        trials=results / "laptop" / "trials.csv",
+        trials=[results / "laptop" / "trials.csv", results / "laptop" / "final.csv"],
     )
     assert page == (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), "run `make results`"
 
@@ -63,6 +63,35 @@ def test_each_method_is_compared_on_the_seeds_that_it_shares_with_the_baseline(t
     page = results_page([scores(tmp_path / f"{name}.csv", name, own) for name, own in returns.items()], baseline="crc")
     assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page  # one seed of stock SAC costs rad none
     assert "| sac | cartpole-swingup | 1 | -760 | not resolved (one seed" in page
+    assert "- sac on cartpole-swingup: no sac with seed 0, 2" in page
+
+
+def test_one_seed_on_another_task_costs_no_seeds(tmp_path: Path) -> None:
+    files = [
+        scores(tmp_path / f"{name}-{task}.csv", name, own, task)
+        for name, task, own in (
+            ("crc", "cartpole-swingup", {0: 800, 1: 860, 2: 900}),
+            ("rad", "cartpole-swingup", {0: 700, 1: 860, 2: 950}),
+            ("crc", "finger-spin", {0: 300}),
+            ("rad", "finger-spin", {0: 200, 1: 210}),
+        )
+    ]
+    page = results_page(files, baseline="crc")
+    assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page
+    assert "| rad | finger-spin | 0 | -100 | not resolved (one seed" in page
+    assert "- rad on finger-spin: no crc with seed 1" in page
+
+
+def test_all_trials_before_are_counted_with_their_seeds(tmp_path: Path) -> None:
+    for name, rows in (("trials", "rad,0\nrad,1\ncrc,0\n"), ("earlier", "crc,11\n")):
+        (tmp_path / f"{name}.csv").write_text(f"algo,seed\n{rows}")
+    files = [str(tmp_path / f"{name}.csv") for name in ("trials", "earlier")]
+    source, page = scores(tmp_path / "a.csv", "crc", {0: 800}), tmp_path / "page.md"
+    arguments = ["results", str(source), "--baseline", "crc", "-o", str(page), "--trials", files[0], "--trials", files[1]]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    assert "2 of rad, 1 of crc, with seeds 0, 1 (trials.csv); 1 of crc, with seed 11 (earlier.csv)" in text
+    assert "were used by no training; trials before used them too" in text and "no other evaluation" not in text
 
 
 def test_pages_of_nothing_are_refused(tmp_path: Path) -> None:

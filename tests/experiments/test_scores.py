@@ -1,5 +1,6 @@
 """From the folders of runs to one table of scores."""
 
+import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -9,11 +10,13 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from typer.testing import CliRunner
 
 from sb3_crc import CRCSAC, make_dmc
+from sb3_crc.cli import app
 from sb3_crc.evaluation import FIRST_SEED as FIRST_EVALUATION
 from sb3_crc.experiments import final
-from sb3_crc.experiments.runs import FAILURE, FINAL, PROVENANCE, SPEC, Run, find_runs, read_json, write_json
+from sb3_crc.experiments.runs import FAILURE, FINAL, PROVENANCE, SPEC, Run, add_provenance, find_runs, read_json, write_json
 from sb3_crc.experiments.scores import COLUMNS, MixedProtocols, final_means, one_protocol, read_scores, write_scores
 from tests.test_zoo import ROOT, command, environment
 
@@ -92,6 +95,52 @@ def test_scores_come_back_from_csv(folder: Path, tmp_path: Path) -> None:
     assert again.table["return"].tolist() == pytest.approx(scores.table["return"].tolist())
     assert again.missing == ()
     assert len(read_scores([tmp_path / "scores.csv", folder]).table) == len(scores.table), "found twice, counted once"
+
+
+def test_two_sources_that_disagree_about_a_run_are_refused(folder: Path, tmp_path: Path) -> None:
+    final.evaluate_final(only_run(folder), episodes=2)
+    path = tmp_path / "scores.csv"
+    write_scores(read_scores([folder]), path)
+    old = read_scores([path]).table
+    (last,) = old[(old["policy"] == "final") & (old["episode"] == 1)].index
+    before = float(old.loc[last, "return"])
+    old.loc[last, "return"] = before - 5
+    old.to_csv(path, index=False)
+    for sources in ([path, folder], [folder, path]):
+        with pytest.raises(
+            ValueError, match=rf"crc/.*_1: episode 1 of its final .* {before - 5:.3f} in one .* {before:.3f} in an"
+        ):
+            read_scores(sources)
+
+
+def test_runs_that_are_not_ready_are_skipped_and_named(folder: Path) -> None:
+    first = only_run(folder)
+    for name in ("before", "behind"):
+        shutil.copytree(first.folder, folder / name / "crc" / first.folder.name)
+    (folder / "before" / "crc" / first.folder.name / first.model.name).unlink()
+    arguments = ["evaluate", str(folder), "--episodes", "1"]
+    done = CliRunner().invoke(app, [*arguments, "--json"])
+    document = json.loads(done.stdout)
+    assert done.exit_code == 1 and len(document["runs"]) == 2
+    (skipped,) = document["skipped"]
+    assert "before" in skipped["folder"] and "training has not ended" in skipped["reason"]
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 1 and again.stdout.count(" episodes)") == 2
+    assert again.stderr.splitlines()[-1].startswith("skipped: ")
+    assert CliRunner().invoke(app, ["evaluate", str(folder / "behind"), "--json"]).exit_code == 0
+
+
+def test_a_run_that_went_on_names_every_revision(folder: Path) -> None:
+    run = only_run(folder)
+    once = read_json(run.folder / PROVENANCE)
+    assert run.provenance == once and run.distinct("git_revision") == [once["git_revision"]]
+    add_provenance({**once, "git_revision": "later", "machine": once["machine"] | {"cores": 999}}, run.folder)
+    add_provenance({**once, "git_revision": "later"}, run.folder)
+    table = read_scores([folder]).table
+    assert set(table["git_revision"]) == {f"{once['git_revision']}; later"}
+    assert len(run.distinct("machine")) == 2 and len(run.distinct("versions")) == 1
+    assert "; " not in table["versions"][0] and "; " in table["machine"][0] and "cores 999" in table["machine"][0]
+    assert read_json(run.folder / PROVENANCE)["time"] == once["time"]
 
 
 def test_only_a_policy_after_exactly_the_budget_is_scored(folder: Path) -> None:

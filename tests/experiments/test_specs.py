@@ -91,6 +91,16 @@ def test_a_sweep_reaches_into_settings(file: Path) -> None:
         ("seeds: [3, 5]", "", "has no seeds"),
         ("env_kwargs.render_quality: fast", "learning_starts: 2000", "nothing would be learned"),
         ("seeds: [3, 5]", "seeds: [-1]", "seed=-1 must be at least 0"),
+        ("seeds: [3, 5]", "seeds: [10099]", "seed=10099 meets those of evaluations of final policies, 10000 to 10099"),
+        ("seeds: [3, 5]", "seeds: [20100]", "seed=20100 meets those of evaluations during training, .*, 20000 and above"),
+        ("rad: {}", "rad: {train_freq: 3}", "are 2000 agent steps, no multiple of n_envs=1 times train_freq=3"),
+        (
+            "rad: {}",
+            "rad: {n_envs: 16, train_freq: [3, step]}",
+            "2000 agent steps, no multiple of n_envs=16 times train_freq=3",
+        ),
+        ("rad: {}", "rad: {train_freq: [1, episode]}", r"train_freq=\[1, 'episode'\] would not end after exactly the budget"),
+        ("rad: {}", "rad: {n_envs: 0}", "n_envs=0 must be a whole number, at least 1"),
         ("tasks: [cartpole-swingup]", "tasks: [cartpole-swngup]", "Did you mean 'cartpole-swingup'"),
     ],
 )
@@ -98,6 +108,17 @@ def test_mistakes_are_named_before_anything_runs(file: Path, old: str, new: str,
     assert old in SWEEP
     file.write_text(SWEEP.replace(old, new))
     with pytest.raises(ValueError, match=message):
+        read_sweep(file)
+
+
+def test_rollouts_that_end_with_the_budget_and_seeds_beside_those_of_evaluations_pass(file: Path) -> None:
+    new = SWEEP.replace("seeds: [3, 5]", "seeds: [9984, 10100]").replace("rad: {}", "rad: {n_envs: 16, train_freq: [5, step]}")
+    file.write_text(new)
+    assert [spec.settings.get("n_envs") for spec in read_sweep(file)] == [16, None, 16, None]
+    file.write_text(new.replace("9984", "9985"))
+    with pytest.raises(
+        ValueError, match="rad on cartpole-swingup: seed=9985 meets those of"
+    ):  # its last environment has 10 000
         read_sweep(file)
 
 

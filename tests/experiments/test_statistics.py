@@ -92,6 +92,14 @@ def test_one_seed_has_no_interval() -> None:
     assert profile(matrices, np.array([0.0, 500.0]), reps=REPS)["crc"].interval is None
 
 
+def test_two_seeds_have_an_interval_but_no_verdict() -> None:
+    base = np.array([[0.1], [0.5], [0.9]])
+    (two,) = differences({"base": base[:2], "plus": base[:2] + 0.05}, "base", reps=REPS)
+    (three,) = differences({"base": base, "plus": base + 0.05}, "base", reps=REPS)
+    assert two.iqm.interval == pytest.approx((50, 50)) and two.verdict == "not resolved (2 seeds)" and not two.resolved
+    assert three.verdict == "better" and three.resolved
+
+
 def test_unknown_baseline_and_other_seeds_are_refused(noisy: dict[str, np.ndarray]) -> None:
     with pytest.raises(ValueError, match=r"no method 'rad'.*low, also low, high"):
         differences(noisy, "rad", reps=REPS)

@@ -36,7 +36,7 @@ def trials(
 def results(
     sources: Annotated[
         list[Path],
-        typer.Argument(help="CSV files of scores, or folders that contain such or runs.", autocompletion=completion.runs),
+        typer.Argument(help="CSV files of scores, or folders that contain runs.", autocompletion=completion.runs),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Markdown file to write.")] = Path("results.md"),
     baseline: Annotated[
@@ -46,13 +46,15 @@ def results(
         Path | None, typer.Option("--landmarks", help="JSON file of `sb3-crc landmarks`; else they are not in it.")
     ] = None,
     trials: Annotated[
-        Path | None, typer.Option(help="CSV file of `sb3-crc trials`, to say how many led to the settings.")
+        list[Path] | None,
+        typer.Option(help="CSV file of `sb3-crc trials`, to say how many led to the settings; once for each file."),
     ] = None,
 ) -> object:
     """What scores show and what they do not, as a page: each seed, chances to reach what is published, what was not done."""
     from sb3_crc.experiments.evidence import results_page
 
-    output.write_text(results_page(sources, baseline=baseline, landmarks=landmarks_file, trials=trials), encoding="utf-8")
+    page = results_page(sources, baseline=baseline, landmarks=landmarks_file, trials=trials or ())
+    output.write_text(page, encoding="utf-8")
     say(str(output))
     return {"written": [output]}
 

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 from typing import Annotated, Any
+from zipfile import BadZipFile
 
 import typer
 
 from sb3_crc import completion
-from sb3_crc.command import Group, command, require
+from sb3_crc.command import Group, No, command, require
 from sb3_crc.console import say, tell
 
 app = typer.Typer()
@@ -27,26 +28,35 @@ def evaluate(
     episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes of each run.")] = 10,
     again: Annotated[bool, typer.Option("--again", help="Evaluate also what has been evaluated.")] = False,
 ) -> object:
-    """Score final policies: mean action, fresh episodes, seeds that no training and no other evaluation has seen."""
+    """Score final policies: mean action, fresh episodes from seeds that no training has. Runs that are not ready are named."""
     from sb3_crc.experiments.runs import find_runs
 
     found = list(find_runs(runs))
     if not found:
         raise FileNotFoundError(f"no run of train.py in {', '.join(map(str, runs))}")
     scored: list[dict[str, Any]] = []
+    skipped: list[dict[str, Any]] = []
     for number, run in enumerate(found, 1):
-        final = None if again else run.final
-        if final is None:
-            from sb3_crc.experiments.final import evaluate_final
+        try:
+            final = None if again else run.final
+            if final is None:
+                from sb3_crc.experiments.final import evaluate_final
 
-            tell(f"[{number}/{len(found)}] {run.folder}: {episodes} episodes")
-            final = evaluate_final(run, episodes=episodes)
+                tell(f"[{number}/{len(found)}] {run.folder}: {episodes} episodes")
+                final = evaluate_final(run, episodes=episodes)
+            about = {"folder": run.folder, "method": run.method, "task": run.task, "seed": run.seed}
+        except (FileNotFoundError, ValueError, BadZipFile) as error:
+            skipped.append({"folder": run.folder, "reason": str(error)})
+            continue
         returns = final["returns"]
         mean = sum(returns) / len(returns)
         say(f"{run.folder}: {mean:.1f} ({min(returns):.1f} to {max(returns):.1f}, {len(returns)} episodes)")
-        about = {"folder": run.folder, "method": run.method, "task": run.task, "seed": run.seed}
         scored.append({**about, "mean": mean, "returns": returns})
-    return {"runs": scored}
+    for one in skipped:
+        named = str(one["folder"]) in one["reason"]
+        tell(f"skipped: {one['reason'] if named else '{folder}: {reason}'.format(**one)}")
+    document = {"runs": scored, "skipped": skipped}
+    return No(document) if skipped else document
 
 
 @command(app, Group.RUNS, "sb3-crc table 100k runs --format markdown", "sb3-crc table 100k results/laptop/final")
@@ -130,10 +140,13 @@ def curve(
 ) -> object:
     """Draw the learning curve of a run, or those of several methods and seeds, beside policies that have learned nothing."""
     from sb3_crc.experiments.curves import plot_learning_curve, plot_learning_curves
-    from sb3_crc.experiments.runs import read_json
+    from sb3_crc.experiments.runs import Run, read_json
 
     measured = {} if baselines is None else read_json(baselines)
     references = {f"{name} policy": policy["mean"] for name, policy in measured.items()}
+    tasks = {Run(run).task for run in runs if _is_described(run)}
+    if len(tasks) > 1:
+        raise ValueError(f"these runs are of several tasks, {', '.join(sorted(tasks))}: `sb3-crc curves` draws those")
     repeat = _common_repeat(runs) if action_repeat is None else action_repeat
     shared: dict[str, Any] = {"action_repeat": repeat, "title": title, "references": references}
     files = [run / "evaluations.npz" for run in runs]
@@ -142,16 +155,21 @@ def curve(
     else:
         methods: dict[str, list[Path]] = {}
         for file in files:
-            methods.setdefault(file.parent.parent.name, []).append(file)
+            method = Run(file.parent).method if _is_described(file.parent) else file.parent.parent.name
+            methods.setdefault(method, []).append(file)
         plot_learning_curves(methods, output, **shared)
     say(str(output))
     return {"written": [output]}
 
 
+def _is_described(run: Path) -> bool:
+    return any(run.glob("*/args.yml"))
+
+
 def _common_repeat(runs: list[Path]) -> int:
     from sb3_crc.experiments.runs import Run
 
-    repeats = {Run(run).action_repeat if any(run.glob("*/args.yml")) else 1 for run in runs}
+    repeats = {Run(run).action_repeat if _is_described(run) else 1 for run in runs}
     if len(repeats) > 1:
         raise ValueError(
             f"these runs do not share an axis: an agent step is {' or '.join(map(str, sorted(repeats)))} environment steps"

@@ -23,7 +23,7 @@ from sb3_crc.experiments.report.contents import (
     folder_media,
     run_media,
 )
-from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, one_line, read_scores
+from sb3_crc.experiments.scores import MixedProtocols, Scores, final_means, read_scores, recorded
 from sb3_crc.experiments.statistics import Axis, curve, training_runs
 from sb3_crc.experiments.table_formats import Grid, grids
 from sb3_crc.experiments.tables import fits, paper_table
@@ -213,8 +213,8 @@ def _settings_section(contents: Sequence[RunContents]) -> str:
 def _runs_section(contents: Sequence[RunContents]) -> str:
     rows = []
     for one in contents:
-        about = [one_line(one.provenance.get(name)) for name in ("machine", "versions")]
-        rows.append([one.name, one.run.status, *(text or "" for text in (*about, one.provenance.get("git_revision")))])
+        about = [recorded(one.run, name) or "" for name in ("machine", "versions", "git_revision")]
+        rows.append([one.name, one.run.status, *about])
     commands = "".join(
         f"<h3>{html.escape(one.name)}</h3><pre>{html.escape(one.command or 'not recorded')}</pre>" for one in contents
     )
