@@ -118,6 +118,11 @@ class BaseCRCSAC(CheckedSAC):
             self.replay_buffer_kwargs = derived | self.replay_buffer_kwargs
             self.n_steps = 1  # SB3 would warn that a class it does not know ignores them
 
+    def _frames_of(self, encoder_kwargs: dict[str, Any]) -> dict[str, int]:
+        """:return: what an encoder that feeds differences of frames must know, unless it is told"""
+        channels = self._frame_channels if self.env is None else stacked_frame_channels(self.env)
+        return {"frame_channels": channels} if channels and encoder_kwargs.get("frame_differences") else {}
+
     def _setup_lr_schedule(self) -> None:
         self._lr_schedules: dict[str, FloatSchedule] = {}
         for name in ("learning_rate", "qf_learning_rate", "encoder_learning_rate", "ent_coef_learning_rate"):

@@ -197,7 +197,7 @@ def _stage(policy: Path, task: str | None) -> tuple[str, dict[str, Any]]:
 
     :return: task, and arguments of make_dmc
     """
-    from sb3_crc.envs.tasks import default_action_repeat, task_names
+    from sb3_crc.envs.tasks import NAMESPACE, default_action_repeat, task_names
     from sb3_crc.export import PolicyFileError, environment_of
 
     try:
@@ -206,6 +206,11 @@ def _stage(policy: Path, task: str | None) -> tuple[str, dict[str, Any]]:
         if task is None:
             raise
         return task, {}
+    if task is None and "/" in own and not own.startswith(f"{NAMESPACE}/"):
+        raise ValueError(
+            f"{policy} acts in {own!r}, which is no task of dm_control: load it in Python (sb3_crc.load_policy), with an "
+            "environment of yours, or name a task by --task"
+        )
     if task is None:
         return own, env_kwargs
     repeat = {"action_repeat": default_action_repeat(own)} if own in task_names() else {}

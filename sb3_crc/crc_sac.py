@@ -201,7 +201,8 @@ class CRCSAC(BaseCRCSAC):
         self._objective_weights = objective_weights(self.objectives)
 
         own_policy_kwargs = self.policy_kwargs
-        encoder_kwargs = {"image_size": self._network_input(), **own_policy_kwargs.get("features_extractor_kwargs", {})}
+        own_kwargs = own_policy_kwargs.get("features_extractor_kwargs", {})
+        encoder_kwargs = {"image_size": self._network_input(), **self._frames_of(own_kwargs), **own_kwargs}
         self._setup_lr_schedule()
         self.policy_kwargs = {
             **own_policy_kwargs,

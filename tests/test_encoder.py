@@ -6,9 +6,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from sb3_crc import PixelDecoder, PixelEncoder
-from tests.conftest import NoiseEnv
+from sb3_crc import CRCSAC, PixelDecoder, PixelEncoder
+from sb3_crc.encoder import difference_mixing
+from tests.conftest import POLICY_KWARGS, NoiseEnv
 
 
 def image_space(channels: int = 9, height: int = 100, width: int | None = None) -> spaces.Box:
@@ -113,9 +115,24 @@ def test_the_encoder_serves_stock_sac() -> None:
 def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match="12x12.*needs 15x15"):
         PixelEncoder(image_space(3, 12), channels=(8,) * 4, strides=(2, 1, 1, 1))
+    with pytest.raises(ValueError, match=r"14x14 pixels, cut out of frames of 16x16 \(image_size.*84 %.*needs 15x15"):
+        PixelEncoder(image_space(3, 16), image_size=(14, 14))
     with pytest.raises(ValueError, match="image_size=90.*64x64"):
         PixelEncoder(image_space(3, 64), image_size=90)
     with pytest.raises(ValueError, match="relu.*none, tanh"):
         PixelEncoder(image_space(3, 64), latent_activation="relu")
     with pytest.raises(ValueError, match="expected uint8 images"):
         PixelEncoder(spaces.Box(0, 1, (3, 64, 64), np.float32))
+
+
+def test_differences_are_those_of_the_environments_frames() -> None:
+    """Of gray pictures a frame has one channel."""
+
+    def gray() -> NoiseEnv:
+        return NoiseEnv(channels=1)
+
+    own = {**POLICY_KWARGS["features_extractor_kwargs"], "frame_differences": 4.0}
+    env = VecFrameStack(DummyVecEnv([gray]), 4, channels_order="first")
+    model = CRCSAC("CnnPolicy", env, buffer_size=50, policy_kwargs={**POLICY_KWARGS, "features_extractor_kwargs": own})
+    mixing = model.policy.critic.features_extractor.mixing
+    assert mixing is not None and th.equal(mixing, difference_mixing(4, 1, 4.0))

@@ -22,10 +22,10 @@ def same_bytes(one: np.ndarray, other: np.ndarray) -> bool:
     """
     Unlike ``==``: NaN is itself, and 0.0 is not -0.0.
 
-    :param one: an array whose last axis is contiguous
+    :param one: an array whose last axis, if it has one, is contiguous
     :param other: another, of the same type
     """
-    return np.array_equal(one.view(np.uint8), other.view(np.uint8))
+    return np.array_equal(np.atleast_1d(one).view(np.uint8), np.atleast_1d(other).view(np.uint8))
 
 
 def n_step_returns(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -194,3 +194,28 @@ def test_heads_without_hidden_layers(net_arch: Any) -> None:
     after = parameters(model)
     assert not any(th.equal(before[name], after[name]) for name in ("actor.mu.weight", "critic.qf0.0.weight"))
     assert model.predict(model.env.reset())[0].shape == (1, *model.action_space.shape)
+
+
+class Scalar(gym.Wrapper[Observation, np.ndarray, np.ndarray, np.ndarray]):
+    """One number beside the image, without an axis."""
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray]):
+        super().__init__(env)
+        number = spaces.Box(-1, 1, (), np.float32)
+        self.observation_space = spaces.Dict({"camera": env.observation_space, "number": number})
+        self.frame_channels = 3
+
+    def reset(self, **kwargs: Any) -> tuple[Observation, dict[str, Any]]:
+        image, info = self.env.reset(**kwargs)
+        return {"camera": image, "number": np.array(0.5, np.float32)}, info
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        image, *rest = self.env.step(action)
+        return {"camera": image, "number": np.array(action[0], np.float32)}, *rest
+
+
+def test_a_number_without_an_axis_beside_the_image() -> None:
+    model = make(Scalar(StackEnv())).learn(20)
+    samples = model.replay_buffer.sample(8)
+    assert samples.observations["number"].shape == (8,)
+    assert np.allclose(samples.next_observations["number"], samples.actions[:, 0], atol=1e-6)

@@ -19,8 +19,10 @@ from typer.testing import CliRunner
 from sb3_crc.cli import app
 from sb3_crc.envs.rendering import RenderingUnavailable
 from sb3_crc.experiments import baselines
+from sb3_crc.export import export_policy
 from tests.cli.cases import CASES
 from tests.cli.tree import COMMANDS, options
+from tests.conftest import make_model
 
 #: Command and which of its words is a file or folder that is read
 READ = [(name, place) for name, words in CASES.items() for place, word in enumerate(words) if word.startswith("{")]
@@ -193,3 +195,10 @@ def test_a_bug_keeps_its_traceback(error: Exception, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(baselines, "measure_baselines", raising(error))
     done = CliRunner().invoke(app, BASELINES)
     assert done.exit_code == 1 and done.exception is error
+
+
+def test_a_policy_of_an_environment_of_ones_own_is_for_python(tmp_path: Path) -> None:
+    policy = export_policy(make_model(), tmp_path / "policy.sb3crc", task="own/CentreTheDisc-v0")
+    done = CliRunner().invoke(app, ["enjoy", str(policy)])
+    assert done.exit_code == 2
+    assert "'own/CentreTheDisc-v0', which is no task of dm_control: load it in Python" in " ".join(done.output.split())
