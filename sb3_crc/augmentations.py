@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 from torch.nn import functional as F
 
-from sb3_crc.settings import check_name
+from sb3_crc.settings import check_name, described, height_and_width
 from sb3_crc.transfers import to_device
 
 ImageSize = int | tuple[int, int]
@@ -218,8 +218,8 @@ def _picture(file: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def checked_size(images: Images, size: ImageSize) -> tuple[int, int]:
-    """:return: ``size`` as height and width; :raises ValueError: if it is not within the images."""
-    height, width = (size, size) if isinstance(size, int) else size
+    """:return: ``size`` as height and width; :raises ValueError: if it is no size, or not within the images."""
+    height, width = height_and_width("size", size)
     if not (0 < height <= images.shape[2] and 0 < width <= images.shape[3]):
         raise ValueError(f"cannot crop to {height}x{width}: the images are {images.shape[2]}x{images.shape[3]}")
     return height, width
@@ -247,7 +247,8 @@ def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ..
     :param kwargs: its arguments
     :param shape: ``(C, H, W)`` of the frames
     :return: maps uint8 ``(B, C, H, W)``, stored or a tensor, to uint8 images
-    :raises ValueError: for an unknown name or argument, or one that does not suit the frames
+    :raises ValueError: for an unknown name or argument, or one that does not suit the frames, or if what comes out is no uint8
+        ``(B, C, h, w)``
     """
     check_name("augmentation", name, AUGMENTATIONS)
     known = list(inspect.signature(AUGMENTATIONS[name]).parameters)[1:]  # after the images
@@ -256,12 +257,21 @@ def bind_augmentation(name: str, kwargs: Mapping[str, Any], shape: tuple[int, ..
     augmentation = partial(AUGMENTATIONS[name], **kwargs)
     with th.random.fork_rng(devices=[]):  # the trial must not change the run's random numbers
         try:
-            augmentation(th.zeros(1, *shape, dtype=th.uint8))
+            tried = augmentation(th.zeros(1, *shape, dtype=th.uint8))
         except TypeError as error:
             raise ValueError(f"augmentation_kwargs={dict(kwargs)} do not suit {name!r}: {error}") from error
+    if not (_is_bytes(tried) and tried.ndim == 4 and tried.shape[:2] == (1, shape[0])):
+        raise ValueError(
+            f"augmentation {name!r} turned one frame of {shape} into {described(tried)}: it must return a Tensor of shape "
+            f"(1, {shape[0]}, height, width) and type uint8"
+        )
     if name in CROPS:
         return augmentation
     return lambda images: augmentation(images if isinstance(images, th.Tensor) else images.whole())
+
+
+def _is_bytes(value: object) -> bool:  # a user's own function may return anything
+    return isinstance(value, th.Tensor) and value.dtype == th.uint8
 
 
 def augmented_input(

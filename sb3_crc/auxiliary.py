@@ -26,6 +26,7 @@ from sb3_crc.encoder import PixelEncoder
 from sb3_crc.extractors import ExtractorEncoder, checked_augmentation, trainable_extractor, trainable_parameters
 from sb3_crc.image_spaces import image_shape
 from sb3_crc.objectives import AuxiliaryObjective, ObjectiveSettings, build_objectives, objective_weights, reads_next
+from sb3_crc.representation import checked_loss
 from sb3_crc.schedules import lr_schedule, set_learning_rate
 from sb3_crc.settings import check_name
 from sb3_crc.views import Views
@@ -51,7 +52,7 @@ class AuxiliarySettings:
     encoder_tau: float
 
     def __post_init__(self) -> None:
-        if not objective_weights(self.objectives):
+        if not objective_weights(self.objectives, without="leave the callback away"):
             raise ValueError("objectives={} leaves nothing to train: name at least one, or leave the callback away")
         for name, value in (("gradient_steps", self.gradient_steps), ("batch_size", self.batch_size)):
             if value is None and name == "batch_size":
@@ -149,7 +150,7 @@ class AuxiliaryLearner:
         assert buffer is not None
         batch = buffer.sample(self.batch_size, env=self.model.get_vec_normalize_env())
         views = Views(batch, self._augment, self._encoder, self._key, gamma=self.model.gamma, offers_next=self._reads_next)
-        losses = {name: objective(views) for name, objective in self.objectives.items()}
+        losses = {name: checked_loss(name, objective, views) for name, objective in self.objectives.items()}
         loss = th.stack([self.weights[name] * value for name, value in losses.items()]).sum()
 
         encoder, objectives = (list(part.values()) for part in self._parameters.values())

@@ -14,7 +14,7 @@ from torch import nn
 from sb3_crc.augmentations import ImageSize, center_crop
 from sb3_crc.convolutions import ConvReLU, conv_relu
 from sb3_crc.image_spaces import image_shape, image_space, split_observations
-from sb3_crc.settings import check_name, check_sizes
+from sb3_crc.settings import check_name, check_sizes, height_and_width
 
 #: A batch of images, or a mapping in which there is one
 Observations = th.Tensor | Mapping[str, th.Tensor]
@@ -64,12 +64,8 @@ class PixelEncoder(BaseFeaturesExtractor):
         check_sizes(channels=channels, strides=strides, features_dim=features_dim, kernel_size=kernel_size)
         check_sizes(frame_channels=frame_channels)
         super().__init__(observation_space, features_dim)
-        if len(channels) != len(strides):
-            raise ValueError(f"channels={tuple(channels)} and strides={tuple(strides)} must have the same length")
-        if image_size is None:
-            height, width = frame_size
-        else:
-            height, width = (image_size, image_size) if isinstance(image_size, int) else image_size
+        _check_one_each(channels=channels, strides=strides)
+        height, width = frame_size if image_size is None else height_and_width("image_size", image_size)
         if not (0 < height <= frame_size[0] and 0 < width <= frame_size[1]):
             raise ValueError(f"image_size={image_size} must lie within the frame of {frame_size[0]}x{frame_size[1]} pixels")
 
@@ -97,7 +93,13 @@ class PixelEncoder(BaseFeaturesExtractor):
         self.convolutions = nn.Sequential(*layers)
         minimum = smallest_input(self.strides, kernel_size)
         if min(height, width) < minimum:
-            raise ValueError(f"images of {height}x{width} pixels are too small for this encoder: it needs {minimum}x{minimum}")
+            cut = ""
+            if [height, width] != frame_size:
+                frame = f"{frame_size[0]}x{frame_size[1]}"
+                cut = f", cut out of frames of {frame} (image_size, which for crops is 84 % of the frame by default),"
+            raise ValueError(
+                f"images of {height}x{width} pixels{cut} are too small for this encoder: it needs {minimum}x{minimum}"
+            )
         with th.no_grad():
             output = self.convolutions(th.zeros(1, *self.input_shape))
         #: Shape of the last convolution's output, ``(channels, height, width)``; flattened, the channels come last
@@ -133,6 +135,16 @@ class PixelEncoder(BaseFeaturesExtractor):
         """:param features: convolution output ``(B, F)``; :return: latents ``(B, Z)``"""
         latents: th.Tensor = self.projection(features)
         return latents
+
+
+def _check_one_each(**layers: Sequence[int]) -> None:
+    """:raises ValueError: unless they are sequences of the same length"""
+    for name, numbers in layers.items():
+        if not isinstance(numbers, Sequence):
+            raise ValueError(f"{name}={numbers!r} must be a sequence: one number for each convolution")
+    if len({len(numbers) for numbers in layers.values()}) > 1:
+        each = " and ".join(f"{name}={tuple(numbers)}" for name, numbers in layers.items())
+        raise ValueError(f"{each} must have the same length")
 
 
 class MixedConvReLU(ConvReLU):

@@ -61,12 +61,15 @@ def export_policy(
     :param task: domain-task on which it acts, for ``sb3-crc enjoy``
     :param env_kwargs: of :func:`~sb3_crc.make_dmc` there, plain data: some of :data:`ENVIRONMENT_ARGUMENTS`
     :return: the file
+    :raises TypeError: for any other algorithm or policy
     :raises ValueError: if it has parts that such a file cannot describe: classes of the user's own, spaces of other kinds,
         other arguments of the environment
     """
     if unknown := sorted(set(env_kwargs or {}) - set(ENVIRONMENT_ARGUMENTS)):
         raise ValueError(f"env_kwargs: {', '.join(unknown)} is none of {', '.join(ENVIRONMENT_ARGUMENTS)}")
     policy = model.policy if isinstance(model, CRCSAC) else model
+    if not isinstance(policy, CRCPolicy):
+        raise TypeError(f"a CRCSAC or its policy can be exported, {type(model).__name__} cannot")
     target = Path(path) if Path(path).suffix else Path(path).with_suffix(".sb3crc")
     about = {"format": FORMAT, "configuration": json.dumps(_describe(policy))}
     _read(about["configuration"], target)  # here and now, and not when the policy is needed

@@ -3,7 +3,9 @@
 B batch, C channels (of the whole frame stack), H, W image height and width, P proprioception.
 """
 
+import warnings
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import torch as th
@@ -89,12 +91,24 @@ def as_bytes(observations: Any, observation_space: spaces.Space[Any]) -> Any:
     :param observations: a batch of images with values in [0, 255], or a mapping with such, of any type: environments need not
         keep to their space's, and SB3 takes them by their space
     :param observation_space: what they belong to
-    :return: the same with uint8 images
+    :return: the same with uint8 images; a warning, once, if they seem to be scaled to [0, 1], and would be black
     """
     if isinstance(observations, Mapping):
         key = image_key(observation_space)
         return {**observations, key: as_bytes(observations[key], observation_space[key])}  # type: ignore[index]
-    return observations if observations.dtype == th.uint8 else observations.round().to(th.uint8)
+    if not observations.is_floating_point():
+        return observations.to(th.uint8)
+    if observations.numel() and 0 < observations.max() <= 1:
+        _warn_of_scaled()
+    return observations.round().to(th.uint8)
+
+
+@cache
+def _warn_of_scaled() -> None:
+    warnings.warn(
+        "an observation's pixels are floats of at most 1: values from 0 to 255 are expected, the encoder scales them itself",
+        stacklevel=3,
+    )
 
 
 def _proprioception_spaces(observation_space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:

@@ -33,7 +33,7 @@ from typing_extensions import Self
 from sb3_crc.encoder import PixelEncoder, init_orthogonal, latent_projection
 from sb3_crc.image_spaces import as_bytes, proprioception_dim, split_observations
 from sb3_crc.objectives import ObjectiveSettings, build_objectives
-from sb3_crc.settings import check_name
+from sb3_crc.settings import check_name, is_count
 from sb3_crc.views import View
 
 ACTOR_FEATURES = ("conv", "latent")
@@ -245,10 +245,14 @@ class CRCPolicy(SACPolicy):
             raise ValueError("use_sde=True is not supported: gSDE would need exploration noise on the shared features")
         if not normalize_images:
             raise ValueError("normalize_images=False is not supported: the encoder takes bytes and scales them itself")
-        if not issubclass(features_extractor_class, PixelEncoder):
-            raise ValueError(f"features_extractor_class must be a PixelEncoder, got {features_extractor_class.__name__}")
-        if encoder_steps < 1:
-            raise ValueError(f"encoder_steps={encoder_steps} must be at least 1")
+        if not (isinstance(features_extractor_class, type) and issubclass(features_extractor_class, PixelEncoder)):
+            given = getattr(features_extractor_class, "__name__", repr(features_extractor_class))
+            raise ValueError(f"features_extractor_class must be a PixelEncoder, the class or one derived from it, got {given}")
+        if not callable(activation_fn) or isinstance(activation_fn, nn.Module):
+            raise ValueError(f"activation_fn={activation_fn!r} must be a class of modules, such as torch.nn.ReLU")
+        for name, number in (("n_critics", n_critics), ("encoder_steps", encoder_steps)):
+            if not is_count(number):
+                raise ValueError(f"{name}={number!r} must be an integer, at least 1")
         check_name("actor_features", actor_features, ACTOR_FEATURES)
         low, high = log_std_bounds
         if not -math.inf < low < high < math.inf:

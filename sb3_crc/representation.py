@@ -5,12 +5,14 @@ B batch, F flattened convolution output, Z latent.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_crc.gradients import gradients_of
+from sb3_crc.settings import described
 from sb3_crc.views import Views
 
 #: Share of the old value in the moving average of the gradient norms
@@ -53,13 +55,14 @@ def auxiliary_gradients(
     :param gradient_norms: moving average of each objective's gradient norm at the latent, updated in place
     :param balance: divide each objective by its moving average before weighting, where it has one: not if it reads the
         features alone
+    :raises ValueError: if an objective returns no loss, or one that is detached
     """
     leaves: list[Gradient] = [None, None]
     own: list[Gradient] = []
     metrics: dict[str, th.Tensor] = {}
     total = td_gradient.new_zeros(())
     for index, (name, objective) in enumerate(objectives.items()):
-        loss = objective(views)
+        loss = checked_loss(name, objective, views)
         inputs = [*views.query.leaves, *objective.parameters()]
         gradients = gradients_of([loss], inputs)
         at_latent = th.zeros_like(td_gradient) if gradients[0] is None else gradients[0]
@@ -82,6 +85,25 @@ def auxiliary_gradients(
             metrics[f"representation/{name}_{key}"] = value
     metrics["representation/loss"] = total
     return AuxiliaryGradients((leaves[0], leaves[1]), own, metrics)
+
+
+def checked_loss(name: str, objective: nn.Module, views: Views) -> th.Tensor:
+    """
+    :param name: of the objective
+    :param objective: to ask
+    :param views: of one batch
+    :return: its loss, a scalar with a graph, if anything is trained; its value is not looked at
+    :raises ValueError: if it returns anything else
+    """
+    loss: Any = objective(views)
+    if not isinstance(loss, th.Tensor) or loss.ndim > 0:
+        raise ValueError(f"objective {name!r} returned {described(loss)}: it must return a scalar tensor, of shape ()")
+    if not loss.requires_grad and any(tensor.requires_grad for tensor in (*views.query.leaves, *objective.parameters())):
+        raise ValueError(
+            f"objective {name!r} returned a loss that is detached, and trains nothing: it must be computed from the latent or "
+            "features of views.query, or from its own parameters, without detach() or no_grad()"
+        )
+    return loss
 
 
 def _add(total: Gradient, gradient: Gradient, scale: float | th.Tensor) -> Gradient:

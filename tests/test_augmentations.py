@@ -1,6 +1,8 @@
 """Augmentations: bytes in, bytes out, every offset, one offset per stack."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -9,6 +11,7 @@ from torch.nn import functional as F
 
 from sb3_crc.augmentations import (
     AUGMENTATIONS,
+    augmented_input,
     center_crop,
     random_conv,
     random_crop,
@@ -98,6 +101,27 @@ def test_bad_sizes_are_named() -> None:
         random_crop(images, 21)
     with pytest.raises(ValueError, match="pad=-1"):
         random_shift(images, -1)
+
+
+@pytest.mark.parametrize(
+    ("function", "returned"),
+    [
+        (lambda images: images / 255, r"Tensor of shape \(1, 3, 20, 20\) and type float32"),
+        (lambda images: images[:, :1], r"Tensor of shape \(1, 1, 20, 20\) and type uint8"),
+        (lambda images: images[0], r"Tensor of shape \(3, 20, 20\) and type uint8"),
+        (lambda images: images.numpy(), r"ndarray of shape \(1, 3, 20, 20\) and type uint8"),
+        (lambda images: None, "None"),
+    ],
+)
+def test_what_is_no_batch_of_bytes_is_refused_before_training(
+    monkeypatch: pytest.MonkeyPatch, function: Callable[[th.Tensor], Any], returned: str
+) -> None:
+    """Floats trained on black pictures."""
+    monkeypatch.setitem(AUGMENTATIONS, "own", function)
+    with pytest.raises(
+        ValueError, match=rf"'own' turned.*into (a )?{returned}: it must return.*\(1, 3, height, width\).*uint8"
+    ):
+        augmented_input("own", {}, (3, 20, 20), (20, 20))
 
 
 def test_pictures_may_lie_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

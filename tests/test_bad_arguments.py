@@ -9,6 +9,7 @@ import pytest
 import torch as th
 
 from sb3_crc import CRCSAC
+from sb3_crc.objectives import Contrastive
 from tests.conftest import POLICY_KWARGS, NoiseEnv, construct, make_model
 
 NAN, INFINITY = float("nan"), float("inf")
@@ -47,6 +48,48 @@ def test_an_unknown_algorithm_on_the_command_line(monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_unknown_names_are_met_with_the_nearest_and_the_known(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        construct(**settings)
+
+
+@pytest.mark.parametrize("value", [None, "none"])
+def test_how_to_augment_nothing_is_said(value: str | None) -> None:
+    with pytest.raises(ValueError, match=f"unknown augmentation {value!r}: .*use 'center_crop'.* Known: random_crop"):
+        construct(augmentation=value)
+    with pytest.raises(ValueError, match="unknown objective_augmentation 'none'.*which is None.* Known: random_crop"):
+        construct(objective_augmentation="none")
+
+
+def test_a_name_like_none_of_the_known_is_not_taken_for_one() -> None:
+    with pytest.raises(ValueError, match=r"unknown augmentation 'flip'\. Known: random_crop"):
+        construct(augmentation="flip")
+    with pytest.raises(ValueError, match="unknown balance 'GRAD_NORM'; did you mean 'grad_norm'"):
+        construct(balance="GRAD_NORM")
+
+
+# -- Types -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        *[({"image_size": value}, rf"image_size={value!r} must be.*\(height, width\)") for value in (20.0, "16", True)],
+        ({"image_size": (16, 16, 3)}, r"image_size=\(16, 16, 3\) must be.*\(height, width\)"),
+        ({"augmentation_kwargs": {"size": (16, 16, 3)}}, r"size=\(16, 16, 3\) must be.*\(height, width\)"),
+        ({"objectives": {Contrastive: 1.0}}, r"dotted path as text, such as 'sb3_crc\.objectives\.contrastive\.Contrastive'"),
+        ({"objectives": {1: 1.0}}, "objectives: 1 must be a name"),
+        ({"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn='relu' must be a class.*ReLU"),
+        ({"policy_kwargs": {"activation_fn": th.nn.ReLU()}}, r"activation_fn=ReLU\(\) must be a class.*ReLU"),
+        ({"policy_kwargs": {"features_extractor_class": "NatureCNN"}}, "features_extractor_class.*PixelEncoder.*'NatureCNN'"),
+        *[({"policy_kwargs": {"n_critics": value}}, f"n_critics={value} must be.*at least 1") for value in (0, 1.5)],
+        (
+            {"policy_kwargs": {"features_extractor_kwargs": {"features_dim": 50.0}}},
+            "features_dim=50.0: only integers of at least 1 are allowed",
+        ),
+        ({"policy_kwargs": {"features_extractor_kwargs": {"channels": 32}}}, "channels=32 must be a sequence"),
+    ],
+)
+def test_values_of_other_types_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         construct(**settings)
 
@@ -207,7 +250,9 @@ def test_an_argument_that_there_is_not_is_named_with_the_nearest() -> None:
 
 def test_a_buffer_that_never_holds_a_batch_is_refused_before_it_is_filled() -> None:
     model = CRCSAC("CnnPolicy", NoiseEnv(), batch_size=64, buffer_size=50, learning_starts=100, policy_kwargs=POLICY_KWARGS)
-    with pytest.raises(ValueError, match="batch_size=64 is more than the replay buffer holds, 50 transitions: raise buffer_size"):
+    with pytest.raises(
+        ValueError, match="batch_size=64 is more than the replay buffer holds, 50 transitions: raise buffer_size"
+    ):
         model.learn(120)
     assert model.replay_buffer.size() == 0
     assert model.learn(20).replay_buffer.size() == 20  # random actions alone

@@ -1,12 +1,15 @@
 """Observations and actions that cannot be trained on are refused, with what would be allowed."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_crc import CRCSAC
+from sb3_crc.image_spaces import _warn_of_scaled, as_bytes
 from tests.conftest import NoiseEnv, construct
 
 
@@ -57,6 +60,24 @@ def test_the_policy_must_suit_the_observations(settings: dict[str, Any]) -> None
 def test_dict_observations_have_exactly_one_image(spaces: dict[str, gym.Space[Any]]) -> None:
     with pytest.raises(ValueError, match=r"expected one uint8 image.*found (none|2 \(left, right\))"):
         CRCSAC("MultiInputPolicy", SpacesEnv(gym.spaces.Dict(spaces)), buffer_size=50)
+
+
+def test_pixels_that_seem_scaled_are_warned_of_once() -> None:
+    """Rounded to bytes, they are black."""
+    _warn_of_scaled.cache_clear()
+    space, pixels = images(3, 4, 4), th.rand(2, 3, 4, 4)
+    with pytest.warns(UserWarning, match="values from 0 to 255 are expected"):
+        as_bytes(pixels, space)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for others in (pixels, 255 * pixels, 0 * pixels, pixels[:0]):
+            assert as_bytes(others, space).dtype == th.uint8
+    _warn_of_scaled.cache_clear()
+
+
+def test_masks_are_images_too() -> None:
+    mask = th.rand(2, 3, 4, 4) > 0.5
+    assert th.equal(as_bytes(mask, images(3, 4, 4)), mask.to(th.uint8))
 
 
 @pytest.mark.parametrize("space", [gym.spaces.Discrete(3), gym.spaces.MultiBinary(2), gym.spaces.MultiDiscrete([2, 2])])

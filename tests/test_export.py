@@ -15,6 +15,7 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from torch import nn
@@ -106,6 +107,14 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
     model = make_model(policy_kwargs={**POLICY_KWARGS, "log_std_bounds": (-1e7, 2)})
     with pytest.raises(PolicyFileError, match="-10000000.0 is more than 1048576"):
         export_policy(model, tmp_path / "policy.sb3crc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_algorithms_are_refused_by_name(tmp_path: Path) -> None:
+    model = SAC("CnnPolicy", NoiseEnv(), buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu")
+    for other in (model, model.policy):
+        with pytest.raises(TypeError, match=f"a CRCSAC or its policy can be exported, {type(other).__name__} cannot"):
+            export_policy(other, tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []
 
 

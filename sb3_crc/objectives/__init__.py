@@ -42,16 +42,20 @@ OBJECTIVES: dict[str, type[AuxiliaryObjective]] = {
 ObjectiveSettings = Mapping[str, float | Mapping[str, Any]]
 
 
-def objective_weights(objectives: ObjectiveSettings) -> dict[str, float]:
+def objective_weights(objectives: ObjectiveSettings, *, without: str = "use objectives={}") -> dict[str, float]:
     """
     :param objectives: name -> weight, or name -> ``{"weight": w, **settings}``
+    :param without: what to do for training without them
     :return: name (of a dotted path its last part) -> weight
-    :raises ValueError: for a weight that is missing, negative or not finite
+    :raises ValueError: for a name that is no text, or a weight that is missing, negative or not finite
     """
     if not isinstance(objectives, Mapping):
         raise ValueError(f"objectives must be a mapping name -> weight, got {objectives!r}")
     weights = {}
     for name, setting in objectives.items():
+        if not isinstance(name, str):
+            example = f"{name.__module__}.{name.__qualname__}" if isinstance(name, type) else "my_package.MyObjective"
+            raise ValueError(f"objectives: {name!r} must be a name, or a class's dotted path as text, such as {example!r}")
         weight = setting.get("weight") if isinstance(setting, Mapping) else setting
         if isinstance(weight, bool) or not isinstance(weight, int | float) or not math.isfinite(weight) or weight < 0:
             raise ValueError(f"objectives[{name!r}]: the weight must be a finite number >= 0, got {weight!r}")
@@ -59,7 +63,7 @@ def objective_weights(objectives: ObjectiveSettings) -> dict[str, float]:
     if len(weights) < len(objectives):
         raise ValueError(f"objectives: names must differ in their last part, got {', '.join(objectives)}")
     if weights and not any(weights.values()):
-        raise ValueError("all weights of objectives are zero; use objectives={} to train without auxiliary losses")
+        raise ValueError(f"all weights of objectives are zero; {without} to train without auxiliary losses")
     return weights
 
 

@@ -3,6 +3,7 @@
 B batch, C channels, H, W height and width, Z latent.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -15,7 +16,7 @@ from typing_extensions import Self
 from sb3_crc.decoder import PixelDecoder
 from sb3_crc.encoder import PixelEncoder, scale_pixels
 from sb3_crc.objectives.base import AuxiliaryObjective
-from sb3_crc.settings import check_name
+from sb3_crc.settings import check_name, is_count
 from sb3_crc.views import View, Views
 
 REDUCTIONS = ("mean", "sum")
@@ -108,8 +109,11 @@ class Reconstruction(AuxiliaryObjective):
         decoder_penalty: float = 1e-7,
     ):
         super().__init__(latent_dim, observation_shape, action_dim)
-        if bits is not None and not 1 <= bits <= 8:
-            raise ValueError(f"reconstruction: bits={bits} must be from 1 to 8, or None")
+        if bits is not None and not (is_count(bits) and bits <= 8):
+            raise ValueError(f"reconstruction: bits={bits!r} must be an integer from 1 to 8, or None")
+        for name, factor in (("latent_penalty", latent_penalty), ("decoder_penalty", decoder_penalty)):
+            if isinstance(factor, bool) or not isinstance(factor, int | float) or not 0 <= factor < math.inf:
+                raise ValueError(f"reconstruction: {name}={factor!r} must be a finite number >= 0")
         check_name("reconstruction: reduction", reduction, REDUCTIONS)
         check_name("reconstruction: target", target, TARGETS)
         self.reduction = reduction

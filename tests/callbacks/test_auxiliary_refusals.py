@@ -32,6 +32,7 @@ class Observe(gym.ObservationWrapper[Any, Any, Any]):
     ("kwargs", "message"),
     [
         ({"objectives": {}}, "objectives={} leaves nothing to train"),
+        ({"objectives": {"contrastive": 0}}, "all weights of objectives are zero; leave the callback away"),
         ({"objectives": {"contrastive": -1}}, "must be a finite number >= 0, got -1"),
         ({"gradient_steps": 0}, "gradient_steps=0 must be an integer of at least 1"),
         ({"gradient_steps": None}, "gradient_steps=None must be an integer of at least 1"),

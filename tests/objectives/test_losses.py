@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.objectives import (
     OBJECTIVES,
+    AuxiliaryObjective,
     Consistency,
     Contrastive,
     Reconstruction,
@@ -20,6 +21,8 @@ from sb3_crc.objectives import (
     info_nce,
     reconstruction_loss,
 )
+from sb3_crc.views import Views
+from tests.conftest import make_model
 from tests.test_encoder import image_space
 
 SHAPE = (3, 40, 40)
@@ -215,6 +218,43 @@ def test_bad_settings_are_named(objectives: dict[str, object], message: str) -> 
     encoder = PixelEncoder(image_space(3, 40), features_dim=16)
     with pytest.raises(ValueError, match=message):
         build_objectives(objectives, encoder, 2)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"bits": 2.5}, {"bits": True}, {"bits": 9}, {"latent_penalty": -1}, {"decoder_penalty": "1"}]
+)
+def test_reconstruction_names_the_setting_that_cannot_be(setting: dict[str, Any]) -> None:
+    ((name, value),) = setting.items()
+    with pytest.raises(ValueError, match=f"reconstruction: {name}={value!r} must be"):
+        Reconstruction(16, SHAPE, 2, **setting)
+
+
+class Returns(AuxiliaryObjective):
+    """What its function makes of the latent."""
+
+    function: Any = None
+
+    def forward(self, views: Views) -> th.Tensor:
+        return self.function(views.query.latent)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            lambda latent: latent.square().mean(dim=1),
+            r"a Tensor of shape \(16,\) and type float32: it must return a scalar tensor",
+        ),
+        (lambda latent: None, "None: it must return a scalar tensor"),
+        (lambda latent: 0.5, "0.5: it must return a scalar tensor"),
+        (lambda latent: latent.detach().mean(), "a loss that is detached, and trains nothing"),
+    ],
+)
+def test_what_is_no_loss_is_named_with_its_objective(function: Any, message: str) -> None:
+    model = make_model(objectives={f"{__name__}.Returns": 1.0})
+    model.policy.objectives["Returns"].function = function
+    with pytest.raises(ValueError, match=f"objective 'Returns' returned.*{message}"):
+        model.train(gradient_steps=1, batch_size=16)
 
 
 def test_settings_against_the_papers_advice_warn() -> None:
