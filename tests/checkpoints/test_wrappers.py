@@ -40,7 +40,7 @@ class Counting(gym.Wrapper[Any, Any, Any, Any]):
         self.generator = np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("make_env", [limited, wrapped, elsewhere])
+@pytest.mark.parametrize("make_env", [limited, wrapped, pytest.param(elsewhere, marks=pytest.mark.slow)])
 def test_a_run_goes_on_within_an_episode_that_a_wrapper_counts(make_env: Any, tmp_path: Path) -> None:
     whole = train(tmp_path / "whole", make_env=make_env)
     train(tmp_path / "run", stop=45, make_env=make_env)
