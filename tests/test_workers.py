@@ -198,6 +198,7 @@ def train(folder: Path, marker: Path | None, how: str = "dies") -> CRCSAC:
     return model
 
 
+@pytest.mark.slow
 def test_a_training_whose_environment_failed_goes_on_to_the_same_end(tmp_path: Path) -> None:
     whole = train(tmp_path / "whole", None)
     for how in ("dies", "loses its context"):

@@ -41,7 +41,9 @@ def test_too_little_disk_is_said_before_anything_runs(tmp_path: Path, monkeypatc
         check_disk([needs(disk=1.5), needs(disk=1.5)], tmp_path / "runs")
 
 
-@pytest.mark.parametrize("preset", ["crc", "sac", "state_sac"])
+@pytest.mark.parametrize(
+    "preset", ["crc", pytest.param("sac", marks=pytest.mark.slow), pytest.param("state_sac", marks=pytest.mark.slow)]
+)
 def test_what_is_measured_grows_with_the_run(preset: str) -> None:
     short, long = (
         measure(compared([preset], ["cartpole-swingup"], [0], env_steps=steps, eval_every=400, conf_file=TINY)[0])

@@ -49,6 +49,7 @@ class Limits:
         return self.limits.pop(0)
 
 
+@pytest.mark.slow
 def test_another_back_end_draws_for_one_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(execution, "FIRST_FRAME_WITHIN", Limits("0.0001", "60", "60"))
     (spec,) = plan(specs(), tmp_path)
