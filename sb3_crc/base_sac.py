@@ -1,6 +1,5 @@
 """SB3's SAC as CRCSAC needs it around the algorithm: our policy, four learning rates, counted steps, checked files."""
 
-import difflib
 import io
 import os
 import pathlib
@@ -54,10 +53,10 @@ def check_arguments(algorithm: type[SAC], arguments: Iterable[str], policy_kwarg
     """
     known = sorted({*signature(SAC.__init__).parameters, *signature(algorithm.__init__).parameters} - {"self", "kwargs"})
     for name in arguments:
-        if name not in known:
-            nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-            raise TypeError(f"{algorithm.__name__} has no argument {name!r}{hint} Known: {', '.join(known)}")
+        try:
+            check_name(f"argument of {algorithm.__name__}", name, known)
+        except ValueError as error:
+            raise TypeError(str(error)) from None
     for name in policy_kwargs:
         if name in GIVEN:
             raise ValueError(f"policy_kwargs: {name} is not the policy's own, give {algorithm.__name__} {GIVEN[name]}=...")

@@ -244,7 +244,7 @@ def test_what_the_algorithm_gives_the_policy_is_refused_among_its_own(name: str,
 
 
 def test_an_argument_that_there_is_not_is_named_with_the_nearest() -> None:
-    with pytest.raises(TypeError, match="CRCSAC has no argument 'learning_rates'; did you mean 'learning_rate'"):
+    with pytest.raises(TypeError, match=r"unknown argument of CRCSAC 'learning_rates'; did you mean 'learning_rate'\?"):
         CRCSAC("CnnPolicy", NoiseEnv(), learning_rates=1e-3)
 
 
