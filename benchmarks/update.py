@@ -40,6 +40,7 @@ def measure(
     *,
     repeats: int,
     methods: tuple[str, ...] = tuple(OURS),
+    peers: tuple[str, ...] = (STOCK, LAYOUT, TEXTBOOK),
     on_round: Callable[[int], object] = lambda done: None,
 ) -> list[dict[str, Any]]:
     """
@@ -48,14 +49,18 @@ def measure(
     :param policy_delay: of ours and the textbook's; stock SAC updates its actor every time
     :param repeats: rounds, in each of which every method is timed once
     :param methods: of :data:`OURS`
+    :param peers: what they are compared with
     :param on_round: told how many rounds are done
     :return: a row per method and peer; * marks what changes the mathematics
     """
     setting = networks, batch_size, policy_delay
     programs: dict[str, Callable[[], Work]] = {name: partial(ours, name, *setting) for name in methods}
-    programs[STOCK] = partial(stock, *setting, equal=False)
-    programs[LAYOUT] = partial(stock, *setting, equal=True)
-    programs[TEXTBOOK] = partial(textbook, *setting)
+    theirs = {
+        STOCK: partial(stock, *setting, equal=False),
+        LAYOUT: partial(stock, *setting, equal=True),
+        TEXTBOOK: partial(textbook, *setting),
+    }
+    programs |= {name: theirs[name] for name in peers}
     seconds = interleave(programs, repeats=repeats, on_round=on_round)
     peak = in_fresh_process(matrix_peak)
     rows = []
@@ -66,12 +71,13 @@ def measure(
         row: dict[str, Any] = {"networks": networks, "batch": batch_size, "policy_delay": policy_delay, "method": name}
         row |= spread(per_update)
         for column, peer in (("/ stock", STOCK), ("/ equal layout", LAYOUT), ("/ textbook", TEXTBOOK)):
-            pairs = zip(seconds[name], seconds[peer], strict=True)
-            row[column] = statistics.median(mine / theirs for mine, theirs in pairs)
+            if peer in peers:
+                pairs = zip(seconds[name], seconds[peer], strict=True)
+                row[column] = statistics.median(mine / their for mine, their in pairs)
         if needed is not None:
             row |= {"needed GFLOP": needed / 1e9, "peak %": 100 * needed / median / peak}
         targets = TARGETS.get((name, networks, batch_size), []) if policy_delay == 2 else []
-        rows.append(judged(row, targets))
+        rows.append(judged(row, [target for target in targets if target.figure in row]))
     return rows
 
 
