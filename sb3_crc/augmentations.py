@@ -22,6 +22,8 @@ from sb3_crc.transfers import to_device
 ImageSize = int | tuple[int, int]
 #: Of a picture that is read from a file
 MOST_PIXELS = 1 << 26
+#: Share of red, green and blue in gray (ITU-R BT.601)
+LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class StoredImages(Protocol):
@@ -118,72 +120,91 @@ def gather_pixels(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.
     return images[batch[:, None, None, None], channels[:, None, None], rows[:, None, :, None], columns[:, None, None, :]]
 
 
-def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None = None) -> th.Tensor:
+def random_overlay(images: th.Tensor, *, alpha: float = 0.5, source: str | None = None, frame_channels: int = 3) -> th.Tensor:
     """
     Blend each sample with a random picture, the same for its whole stack (SODA, arXiv 2011.13389).
 
-    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of ``frame_channels``
     :param alpha: share of the picture, in [0, 1]
     :param source: a folder of pictures, for instance of Places365, of which at most 1 000 are read; None: 64 pictures of
         smooth random colours, always the same
+    :param frame_channels: of each frame of the stack: 3 (RGB) or 1 (gray: the pictures' luminance is blended in)
     :return: uint8 ``(B, C, H, W)``
-    :raises ValueError: for an alpha outside [0, 1], stacks that are not RGB, or a folder without pictures
+    :raises ValueError: for an alpha outside [0, 1], stacks of other frames, or a folder without pictures
     """
     if not 0 <= alpha <= 1:
         raise ValueError(f"random_overlay: alpha={alpha} must be within [0, 1]")
-    batch, channels, height, width = images.shape
-    if channels % 3 != 0:
-        raise ValueError(f"random_overlay: needs stacks of RGB frames, got {channels} channels")
-    pictures = _pictures(source, (height, width), images.device)
-    chosen = pictures[to_device(th.randint(len(pictures), (batch,)), images.device)].repeat(1, channels // 3, 1, 1)
-    return th.lerp(images.float(), chosen.float(), alpha).round_().to(th.uint8)
+    frames = _frames("random_overlay", images, frame_channels)
+    pictures = _pictures(source, (images.shape[2], images.shape[3]), images.device)
+    chosen = pictures[to_device(th.randint(len(pictures), (len(images),)), images.device)].float()
+    if frame_channels == 1:
+        chosen = (chosen * th.tensor(LUMINANCE, device=chosen.device)[:, None, None]).sum(1, keepdim=True)
+    return th.lerp(images.float(), chosen.repeat(1, frames, 1, 1), alpha).round_().to(th.uint8)
 
 
 def random_crop_overlay(
-    images: Images, size: ImageSize, *, last_offset: bool = True, alpha: float = 0.5, source: str | None = None
+    images: Images,
+    size: ImageSize,
+    *,
+    last_offset: bool = True,
+    alpha: float = 0.5,
+    source: str | None = None,
+    frame_channels: int = 3,
 ) -> th.Tensor:
     """
     :func:`random_crop`, then :func:`random_overlay` (the released code of CRC-RL).
 
-    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of ``frame_channels``
     :param size: as for :func:`random_crop`
     :param last_offset: as for :func:`random_crop`
     :param alpha: as for :func:`random_overlay`
     :param source: as for :func:`random_overlay`
+    :param frame_channels: as for :func:`random_overlay`
     :return: uint8 ``(B, C, *size)``
     """
-    return random_overlay(random_crop(images, size, last_offset=last_offset), alpha=alpha, source=source)
+    cropped = random_crop(images, size, last_offset=last_offset)
+    return random_overlay(cropped, alpha=alpha, source=source, frame_channels=frame_channels)
 
 
-def random_conv(images: th.Tensor) -> th.Tensor:
+def random_conv(images: th.Tensor, *, frame_channels: int = 3) -> th.Tensor:
     """
     Recolour and blur each sample by a random 3x3 convolution, the same for each frame of its stack, and a sigmoid (SODA,
     arXiv 2011.13389, after arXiv 1910.05396).
 
-    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of ``frame_channels``
+    :param frame_channels: of each frame of the stack: 3 (RGB) or 1 (gray)
     :return: uint8 ``(B, C, H, W)``
-    :raises ValueError: for stacks that are not RGB
+    :raises ValueError: for stacks of other frames
     """
-    batch, channels, height, width = images.shape
-    if channels % 3 != 0:
-        raise ValueError(f"random_conv: needs stacks of RGB frames, got {channels} channels")
-    kernels = to_device(th.randn(3 * batch, 3, 3, 3), images.device)
-    frames = images.view(batch, channels // 3, 3, height, width).transpose(0, 1).flatten(1, 2) / 255  # (k, 3 B, H, W)
+    (batch, _, height, width), k = images.shape, _frames("random_conv", images, frame_channels)
+    kernels = to_device(th.randn(frame_channels * batch, frame_channels, 3, 3), images.device)
+    frames = images.view(batch, k, frame_channels, height, width).transpose(0, 1).flatten(1, 2) / 255  # (k, channels B, H, W)
     recoloured = F.conv2d(F.pad(frames, (1, 1, 1, 1), mode="replicate"), kernels, groups=batch).sigmoid_()
-    stacks = recoloured.view(-1, batch, 3, height, width).transpose(0, 1).reshape(images.shape)
+    stacks = recoloured.view(k, batch, frame_channels, height, width).transpose(0, 1).reshape(images.shape)
     return stacks.mul_(255).round_().to(th.uint8)
 
 
-def random_crop_conv(images: Images, size: ImageSize, *, last_offset: bool = True) -> th.Tensor:
+def random_crop_conv(images: Images, size: ImageSize, *, last_offset: bool = True, frame_channels: int = 3) -> th.Tensor:
     """
     :func:`random_crop`, then :func:`random_conv`.
 
-    :param images: uint8 ``(B, C, H, W)``, C a multiple of 3
+    :param images: uint8 ``(B, C, H, W)``, C a multiple of ``frame_channels``
     :param size: as for :func:`random_crop`
     :param last_offset: as for :func:`random_crop`
+    :param frame_channels: as for :func:`random_conv`
     :return: uint8 ``(B, C, *size)``
     """
-    return random_conv(random_crop(images, size, last_offset=last_offset))
+    return random_conv(random_crop(images, size, last_offset=last_offset), frame_channels=frame_channels)
+
+
+def _frames(name: str, images: th.Tensor, frame_channels: int) -> int:
+    """:return: how many frames a stack has; :raises ValueError: if they do not have ``frame_channels`` each, 1 or 3"""
+    if frame_channels not in (1, 3):
+        raise ValueError(f"{name}: frame_channels={frame_channels!r} must be 3 (RGB) or 1 (gray)")
+    channels = images.shape[1]
+    if channels % frame_channels != 0:
+        raise ValueError(f"{name}: needs stacks of RGB frames, got {channels} channels (frame_channels=1: gray frames)")
+    return channels // frame_channels
 
 
 @lru_cache(maxsize=4)

@@ -85,6 +85,22 @@ def test_random_conv_recolours_each_frame_of_a_stack_alike() -> None:
         random_conv(coordinates(2, 9))
 
 
+def test_gray_frames_are_recoloured_and_overlaid_each_alike() -> None:
+    images = th.randint(0, 256, (6, 1, 10, 12), dtype=th.uint8).repeat(1, 3, 1, 1)  # three gray frames, not one of RGB
+    for augment in (random_conv, random_overlay):
+        changed = augment(images, frame_channels=1)
+        assert not th.equal(changed, images)
+        assert th.equal(changed, changed[:, :1].expand_as(changed))
+        assert augment(images[:, :2], frame_channels=1).shape == (6, 2, 10, 12)  # nor need there be a multiple of three
+        with pytest.raises(ValueError, match=r"frame_channels=4 must be 3 \(RGB\) or 1 \(gray\)"):
+            augment(images, frame_channels=4)
+    th.manual_seed(0)
+    colours = random_overlay(images, alpha=1.0).float()
+    th.manual_seed(0)
+    gray = random_overlay(images, alpha=1.0, frame_channels=1).float()
+    assert th.allclose(gray[:, 0], 0.299 * colours[:, 0] + 0.587 * colours[:, 1] + 0.114 * colours[:, 2], atol=0.51)
+
+
 def test_augmentations_are_reproducible_from_torchs_seed() -> None:
     images = th.randint(0, 256, (32, 3, 20, 20), dtype=th.uint8)
     for augment in (lambda: random_crop(images, 12), lambda: random_shift(images), lambda: random_conv(images)):
