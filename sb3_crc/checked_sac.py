@@ -5,6 +5,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_crc.buffers import FrameReplayBuffer
 from sb3_crc.finite import LossHistory, not_finite, save_transition
@@ -47,6 +48,8 @@ class CheckedSAC(WholeRollouts):
     ) -> None:
         last = {int(env): infos[env].get("terminal_observation") for env in np.flatnonzero(dones)}  # stored in new_obs's place
         found = not_finite({"the reward": reward, "the observation": new_obs}) or _not_finite_at_the_end(last)
+        if self._vec_normalize_env is not None:
+            self._leave_what_is_not_normalized(self._vec_normalize_env, new_obs)
         if found is None:
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
             return
@@ -61,6 +64,17 @@ class CheckedSAC(WholeRollouts):
         self._last_obs = new_obs
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
+    def _leave_what_is_not_normalized(self, normalize: VecNormalize, new_obs: Any) -> None:
+        """Where SB3 stores what VecNormalize keeps, store what wrappers around it made of that (they are there in rl_zoo3)."""
+        if not normalize.norm_obs:
+            self._last_original_obs, normalize.old_obs = self._last_obs, new_obs
+        elif isinstance(new_obs, dict):
+            assert isinstance(self._last_obs, dict)
+            assert isinstance(self._last_original_obs, dict)
+            keys = normalize.norm_obs_keys or []
+            self._last_original_obs = {**self._last_obs, **{key: self._last_original_obs[key] for key in keys}}
+            normalize.old_obs = {**new_obs, **{key: normalize.old_obs[key] for key in keys}}
 
     def _stop_at(self, found: tuple[str, int, float], values: Mapping[str, Any], why: str) -> NoReturn:
         name, env, value = found

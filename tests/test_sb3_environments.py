@@ -1,15 +1,20 @@
 """Environments as SB3's users bring and change them: evaluated, normalised, replaced, with action noise."""
 
+from typing import Any
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
+from sb3_crc import CRCSAC, FrameReplayBuffer
 from tests.compared_models import train_on
-from tests.conftest import NoiseEnv, make_model
+from tests.conftest import POLICY_KWARGS, SIZE, NoiseEnv, make_model
 
 
 def test_evaluate_policy_returns_what_an_own_loop_returns() -> None:
@@ -50,6 +55,46 @@ def test_vec_normalize_normalises_the_rewards_and_leaves_the_images() -> None:
 def test_vec_normalize_of_images_is_refused_with_the_way_out() -> None:
     with pytest.raises(ValueError, match=r"VecNormalize.*norm_obs=False"):
         make_model(VecNormalize(DummyVecEnv([NoiseEnv])))
+
+
+class ChannelsLast(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray]):
+    """RGB pictures as most environments return them, and with ``vector`` five numbers beside them."""
+
+    def __init__(self, vector: bool):
+        super().__init__(NoiseEnv(channels=3))
+        image = gym.spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+        numbers = gym.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+        self.observation_space = gym.spaces.Dict(image=image, numbers=numbers) if vector else image
+        self.vector = vector
+
+    def observation(self, observation: np.ndarray) -> Any:
+        image = observation.transpose(1, 2, 0)
+        return {"image": image, "numbers": observation[0, 0, :5].astype(np.float32)} if self.vector else image
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_vec_normalize_may_have_wrappers_around_it(vector: bool) -> None:
+    """Frames are stacked and transposed after it, which is rl_zoo3's order; what is stored is as without it."""
+    stored = []
+    for normalize in (True, False):
+        venv: VecEnv = DummyVecEnv([lambda: ChannelsLast(vector)])
+        if normalize:
+            venv = VecNormalize(venv, norm_obs=vector, norm_obs_keys=["numbers"] if vector else None)
+        if not vector:
+            venv = VecFrameStack(venv, 2, "last")
+        policy = "MultiInputPolicy" if vector else "CnnPolicy"
+        settings = {"buffer_size": 200, "learning_starts": 25, "policy_kwargs": POLICY_KWARGS, "seed": 0, "device": "cpu"}
+        buffer = CRCSAC(policy, venv, **settings).learn(25).replay_buffer  # two episodes and a half of random actions
+        stored += [buffer.observations, buffer.next_observations]
+    for with_it, without in zip(stored[:2], stored[2:], strict=True):
+        np.testing.assert_equal(with_it, without)
+
+
+def test_stock_sac_is_told_where_vec_normalize_belongs() -> None:
+    venv = VecNormalize(DummyVecEnv([lambda: ChannelsLast(False)]), norm_obs=False)
+    model = SAC("CnnPolicy", venv, buffer_size=50, replay_buffer_class=FrameReplayBuffer, device="cpu")
+    with pytest.raises(ValueError, match=r"\(1, 40, 40, 3\) do not fit.*VecNormalize belongs around VecTransposeImage"):
+        model.learn(5)
 
 
 def test_set_env() -> None:

@@ -213,7 +213,8 @@ class FrameReplayBuffer(PlacedReplayBuffer):
         images = np.asarray(self._images(obs))
         shape = self.n_envs, *self._stacked_space().shape
         if images.shape != shape:
-            raise ValueError(f"observations of shape {images.shape} do not fit the buffer, which stores {shape}")
+            hint = "; VecNormalize belongs around VecTransposeImage" * (images.ndim == 4 and images.shape[3] == shape[1])
+            raise ValueError(f"observations of shape {images.shape} do not fit the buffer, which stores {shape}{hint}")
         stacks = np.ascontiguousarray(images, self.store.dtype)
         return stacks.reshape(self.n_envs, self.stack_size, *self.store.shape)
 
