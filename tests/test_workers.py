@@ -80,13 +80,12 @@ def make_failing(how: str) -> Failing:
     return Failing("works")
 
 
-@pytest.mark.parametrize("index", [0, 1])
+HANGS = "hangs", r"environment {} \(process \d+\) has not been made within 5 s: it hangs"
+RAISES = "raises", r"environment {} \(process \d+\) has ended with exit code 1, before it was made"
+
+
 @pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ("hangs", r"environment {} \(process \d+\) has not been made within 5 s: it hangs"),
-        ("raises", r"environment {} \(process \d+\) has ended with exit code 1, before it was made"),
-    ],
+    ("how", "message", "index"), [(*RAISES, 0), (*RAISES, 1), pytest.param(*HANGS, 0, marks=pytest.mark.slow), (*HANGS, 1)]
 )
 def test_an_environment_that_cannot_be_made_is_named(
     how: str, message: str, index: int, monkeypatch: pytest.MonkeyPatch

@@ -8,6 +8,7 @@ from benchmarks.scaling import measure
 TINY = Networks("tiny", 40, 24, {"channels": [4, 4], "strides": [2, 2], "features_dim": 8}, (16, 16))
 
 
+@pytest.mark.slow
 def test_batches_and_inputs_have_their_rows_and_are_compared_with_the_reference():
     rows = measure(repeats=1, networks=TINY, batch_sizes=(128, 256), input_sizes=(24, 36))
     batches, inputs = ([row for row in rows if row["varied"] == varied] for varied in ("batch", "input"))

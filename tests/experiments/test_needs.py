@@ -53,6 +53,7 @@ def test_what_is_measured_grows_with_the_run(preset: str) -> None:
     assert short.gpu_memory == 0 and short.disk < long.disk
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_hours_memory_and_disk(tmp_path: Path) -> None:
     own = ["--task", "cartpole-swingup", "--presets", "rad", "--seeds", "2", "--env-steps", "1200", "--eval-every", "400"]
     done = CliRunner().invoke(app, ["compare", *own, "--conf-file", str(TINY), "-o", str(tmp_path / "runs"), "--dry-run"])
