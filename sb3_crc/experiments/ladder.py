@@ -66,7 +66,7 @@ def state_sac(
     env, fresh = (make_dmc(task, observation="state", seed=seed + offset) for offset in (0, 1000))
     scaled = TransformReward(env, lambda reward: reward_scale * float(reward))
     model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", **STATE_SAC)  # type: ignore[arg-type]
-    curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, env.action_repeat)
+    curve = learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, env.action_repeat)
     settings = {**STATE_SAC, "reward_scale": reward_scale}
     return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
 
@@ -104,14 +104,25 @@ def seen_state_sac(
     scaled = TransformReward(env, lambda reward: 0.1 * float(reward))
     rate: Any = lr_schedule("lin_0.001") if falling_rates else settings["learning_rate"]
     model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **{**settings, "learning_rate": rate})
-    curve = _learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
+    curve = learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
     settings |= {"reward_scale": 0.1, "error": error, "falling_rates": falling_rates}
     return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
 
 
-def _learning_curve(
+def learning_curve(
     model: SAC, fresh: gym.Env[Any, Any], agent_steps: int, evaluations: int, episodes: int, action_repeat: int
 ) -> list[dict[str, float]]:
+    """
+    Train, and stop to evaluate.
+
+    :param model: that has not learned yet
+    :param fresh: in which it is evaluated
+    :param agent_steps: to train for
+    :param evaluations: how often it is evaluated, at equal distances
+    :param episodes: of each evaluation
+    :param action_repeat: environment steps of an agent step
+    :return: of each evaluation environment steps, mean, standard deviation and least return
+    """
     with TemporaryDirectory() as folder:
         evaluation = EvalCallback(
             fresh, eval_freq=agent_steps // evaluations, n_eval_episodes=episodes, log_path=folder, verbose=0
@@ -123,7 +134,7 @@ def _learning_curve(
         {
             "environment_steps": int(agent_step) * action_repeat,
             "mean": float(np.mean(returns)),
-            "std": float(np.std(returns, ddof=1)),
+            "std": float(np.std(returns, ddof=1)) if len(returns) > 1 else 0.0,
             "min": float(np.min(returns)),
         }
         for agent_step, returns in measured

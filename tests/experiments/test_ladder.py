@@ -53,7 +53,7 @@ def test_the_command_writes_json_and_names_the_rungs(tmp_path: Path) -> None:
     config = tmp_path / "small.yml"
     config.write_text(f"default: {{policy_kwargs: {{features_extractor_kwargs: {json.dumps(SMALL)}}}}}")
     result = runner.invoke(app, ["ladder", "stairs", "--config", str(config)])
-    assert result.exit_code == 2 and "state, seen, probe, teach, overfit" in result.output
+    assert result.exit_code == 2 and "state, screen, seen, probe, teach, overfit" in result.output
     config.write_text("default: {policy: CnnPolicy}")
     result = runner.invoke(app, ["ladder", "probe", "--config", str(config)])
     assert result.exit_code == 2 and "has no policy_kwargs for cartpole-swingup" in result.stderr.replace("\n", "")

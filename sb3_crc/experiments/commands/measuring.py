@@ -9,10 +9,11 @@ import typer
 from sb3_crc import completion
 from sb3_crc.command import Group, as_json, command
 from sb3_crc.console import say
+from sb3_crc.settings import check_name
 
 app = typer.Typer()
 
-RUNGS = ("state", "seen", "probe", "teach", "overfit")
+RUNGS = ("state", "screen", "seen", "probe", "teach", "overfit")
 
 
 @command(app, Group.TASKS, "sb3-crc baselines cartpole-swingup --episodes 5", "sb3-crc baselines walker-walk --json")
@@ -61,21 +62,28 @@ def landmarks(
     Group.TASKS,
     "sb3-crc ladder probe cartpole-swingup",
     "sb3-crc ladder seen --error 0.03 --n-steps 1 --n-steps 3 --output seen_3cm.json",
+    "sb3-crc ladder screen finger-spin --set n_steps=1 --set reward_scale=1 --evaluations 10",
 )
 def ladder(
     rung: Annotated[
         str,
         typer.Argument(
-            help="state: SAC from states; seen: SAC from positions as an encoder could see them; probe: an untrained encoder; "
-            "teach: a taught one; overfit: each loss.",
+            help="state: SAC from states; screen: the same with a configuration's settings; seen: SAC from positions as an "
+            "encoder could see them; probe: an untrained encoder; teach: a taught one; overfit: each loss.",
             autocompletion=completion.one_of(*RUNGS),
         ),
     ],
     task: Annotated[str, typer.Argument(help="domain-task.", autocompletion=completion.tasks)] = "cartpole-swingup",
     output: Annotated[Path | None, typer.Option(help="JSON file to write too.")] = None,
     config: Annotated[
-        Path, typer.Option(help="Configuration of rl-zoo whose policy_kwargs are used, rungs probe, teach, overfit.")
+        Path,
+        typer.Option(
+            help="Configuration of rl-zoo: its policy_kwargs in rungs probe, teach, overfit, its settings in screen."
+        ),
     ] = Path("zoo_configs/laptop.yml"),
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="name=value: another setting, rung screen; once for each.")
+    ] = None,
     reward_scale: Annotated[float, typer.Option(help="Factor on the rewards, rung state.")] = 1.0,
     error: Annotated[
         list[float] | None, typer.Option(help="Of what is read off a frame, in metres, rung seen; once for each; else 0.")
@@ -86,7 +94,7 @@ def ladder(
     target_entropy: Annotated[float, typer.Option(help="Of the policy, in nats, rung seen.")] = -1.0,
     falling_rates: Annotated[bool, typer.Option("--falling-rates", help="Learning rates that end at 0, rung seen.")] = False,
     agent_steps: Annotated[int, typer.Option(min=600, help="Budget of each training in agent steps, rung seen.")] = 7_500,
-    evaluations: Annotated[int, typer.Option(min=1, help="How many in each training, rung seen.")] = 6,
+    evaluations: Annotated[int, typer.Option(min=1, help="How many in each training, rungs seen and screen.")] = 6,
     seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
 ) -> object:
     """Measure what must work before learning from pixels can."""
@@ -98,6 +106,8 @@ def ladder(
 
     if rung == "state":
         measured: Any = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
+    elif rung == "screen":
+        measured = _screened(config, task, changes or [], evaluations, seed)
     elif rung == "seen":
         shared: dict[str, Any] = {"target_entropy": target_entropy, "falling_rates": falling_rates}
         shared |= {"agent_steps": agent_steps, "evaluations": evaluations, "seed": seed}
@@ -119,6 +129,23 @@ def ladder(
         say(f"{name}: {value}")
     _keep(measured, output)
     return measured
+
+
+def _screened(config: Path, task: str, changes: list[str], evaluations: int, seed: int) -> Mapping[str, Any]:
+    import yaml
+
+    from sb3_crc.configurations import read_settings, with_overrides
+    from sb3_crc.envs.tasks import environment_id
+    from sb3_crc.experiments.screening import USED, screened_state_sac
+
+    settings = read_settings(config, "rad", environment_id(task))
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not (name and equals):
+            raise typer.BadParameter(f"{change!r} is not name=value", param_hint="--set")
+        check_name("--set", name, USED)
+        settings = with_overrides(settings, {name: yaml.safe_load(value)})
+    return screened_state_sac(task, settings, evaluations=evaluations, seed=seed)
 
 
 def _policy_kwargs(config: Path, task: str) -> Mapping[str, Any]:
