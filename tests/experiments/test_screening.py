@@ -31,7 +31,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[SAC]:
 
 
 def test_the_configurations_settings_are_trained_with(trained: list[SAC]) -> None:
-    settings = read_settings(LAPTOP, "rad", "dmc_pixels/finger-spin-v0")
+    settings = read_settings(LAPTOP, "rad", "dmc_pixels/finger-spin-v0") | {"n_steps": 3, "reward_scale": 0.1}
     measured = screened_state_sac("finger-spin", {**settings, "n_timesteps": 540}, evaluations=2, episodes=1)
     (model,) = trained
     assert (model.n_steps, model.batch_size, model.tau, model.gamma, model.buffer_size) == (3, 128, 0.02, 0.99, 50_000)
