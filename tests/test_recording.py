@@ -86,10 +86,17 @@ def assert_same(one: CRCSAC, other: CRCSAC) -> None:
         th.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-6)
 
 
+#: What takes longest to record, and is replayed as the others are
+LONGER = dict.fromkeys(("crc_release", "drq", "sac_ae"), pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     "own",
     [
-        *({key: value for key, value in settings.items() if key not in OWN} for settings in PRESETS.values()),
+        *(
+            pytest.param({key: value for key, value in settings.items() if key not in OWN}, marks=LONGER.get(name, ()))
+            for name, settings in PRESETS.items()
+        ),
         {"joint_update": True, "policy_delay": 3, "n_steps": 3},
         {"balance": "grad_norm", "auxiliary_interval": 2, "max_grad_norm": 1.0, "ent_coef": 0.1},
         {"objectives": {"contrastive": {"weight": 1.0, "key": "next"}}, "n_steps": 3, "augmentation": "random_shift"},

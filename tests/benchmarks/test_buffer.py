@@ -30,6 +30,7 @@ def rows():
         return {row["buffer"]: row for row in measure((SIZE,), repeats=1, batch_size=8, peers=(OURS, STOCK))}
 
 
+@pytest.mark.slow
 def test_each_peer_has_a_row_of_positive_figures(rows):
     assert list(rows) == [OURS, STOCK]
     for row in rows.values():
@@ -46,6 +47,7 @@ def test_each_peer_has_a_row_of_positive_figures(rows):
     assert set(rows[OURS]["targets"]) == {"add - copy us", "growing add - copy us", "sample ms"}
 
 
+@pytest.mark.slow
 def test_a_sixth_of_the_memory_is_measured(rows):
     ours, stock = rows[OURS], rows[STOCK]
     assert ours["/ SB3"] < 0.25

@@ -43,7 +43,7 @@ def test_commands_and_options() -> None:
         ("sb3-crc contact-sheet --modes n", []),
         ("sb3-crc table ", ["100k", "500k"]),
         ("sb3-crc table 100k runs --format l", ["latex"]),
-        ("sb3-crc ladder s", ["state", "seen"]),
+        ("sb3-crc ladder s", ["state", "screen", "seen"]),
         ("sb3-crc contact-sheet --tasks walker-walk,lqr", ["walker-walk,lqr-lqr_2_1", "walker-walk,lqr-lqr_6_2"]),
     ],
 )

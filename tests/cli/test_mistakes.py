@@ -116,7 +116,7 @@ def test_values_that_cannot_be(name: str) -> None:
         (["baselines", "cartpole-swngup"], "Did you mean 'cartpole-swingup'?"),
         (["baselines", "cartpole-swingup", "--episodes", "1"], "Invalid value for '--episodes'"),
         (["landmarks", "--task", "walker"], "Unknown task 'walker'"),
-        (["ladder", "stairs"], "'stairs' is none of state, seen, probe, teach, overfit"),
+        (["ladder", "stairs"], "'stairs' is none of state, screen, seen, probe, teach, overfit"),
         (["table", "200k", "{csv}"], "200k"),
         (["contact-sheet", "--tasks", "cartpole"], "Unknown task 'cartpole'"),
         (["contact-sheet", "--tasks", " ,"], "no task is given"),
