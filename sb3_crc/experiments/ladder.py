@@ -100,13 +100,24 @@ def seen_state_sac(
     states = [make_dmc(task, observation="state", seed=seed + offset) for offset in (0, 1000)]
     env, fresh = (SeenPositions(state, error=error, seed=seed) for state in states)
     settings = {**STATE_SAC, "ent_coef": "auto_0.1", "n_steps": n_steps, "target_entropy": target_entropy, "batch_size": 128}
-    heads = {"net_arch": [256, 256], "activation_fn": lambda: nn.Sequential(nn.LayerNorm(256), nn.ReLU())}
+    heads = {"net_arch": [256, 256], "activation_fn": normalized([256, 256])}
     scaled = TransformReward(env, lambda reward: 0.1 * float(reward))
     rate: Any = lr_schedule("lin_0.001") if falling_rates else settings["learning_rate"]
     model = SAC("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=heads, **{**settings, "learning_rate": rate})
     curve = learning_curve(model, Monitor(fresh), agent_steps, evaluations, episodes, states[0].action_repeat)
     settings |= {"reward_scale": 0.1, "error": error, "falling_rates": falling_rates}
     return {"task": task, "seed": seed, "settings": settings, "episodes": episodes, "curve": curve}
+
+
+def normalized(net_arch: Any) -> Any:
+    """
+    :param net_arch: width of each layer of the heads
+    :return: what SB3 can put behind each of them: LayerNorm, then ReLU
+    :raises ValueError: if they have several widths
+    """
+    if not isinstance(net_arch, list) or len(set(net_arch)) != 1:
+        raise ValueError(f"net_arch={net_arch!r} with layer_norm: layers of one width are needed, for instance [256, 256]")
+    return lambda: nn.Sequential(nn.LayerNorm(net_arch[0]), nn.ReLU())
 
 
 def learning_curve(
@@ -134,7 +145,7 @@ def learning_curve(
         {
             "environment_steps": int(agent_step) * action_repeat,
             "mean": float(np.mean(returns)),
-            "std": float(np.std(returns, ddof=1)) if len(returns) > 1 else 0.0,
+            "std": float(np.std(returns, ddof=1)),
             "min": float(np.min(returns)),
         }
         for agent_step, returns in measured

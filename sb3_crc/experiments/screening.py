@@ -6,10 +6,9 @@ from typing import Any
 from gymnasium.wrappers import TransformReward
 from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
-from torch import nn
 
 from sb3_crc.envs.dmc import make_dmc
-from sb3_crc.experiments.ladder import learning_curve
+from sb3_crc.experiments.ladder import learning_curve, normalized
 from sb3_crc.schedules import lr_schedule
 
 #: Settings that stock SAC has too
@@ -60,7 +59,7 @@ def screened_state_sac(
     if "net_arch" in policy_kwargs:
         heads["net_arch"] = policy_kwargs["net_arch"]
         if policy_kwargs.get("layer_norm"):
-            heads["activation_fn"] = _normalized(policy_kwargs["net_arch"])
+            heads["activation_fn"] = normalized(policy_kwargs["net_arch"])
     reward_scale, rate = settings.get("reward_scale", 1.0), settings.get("learning_rate", 3e-4)
     env, fresh = (make_dmc(task, observation="state", seed=seed + offset) for offset in (0, 1000))
     scaled = TransformReward(env, lambda reward: reward_scale * float(reward))
@@ -75,10 +74,3 @@ def screened_state_sac(
         "policy_kwargs": {k: policy_kwargs.get(k) for k in ("net_arch", "layer_norm")},
     }
     return {"task": task, "seed": seed, "settings": used, "episodes": episodes, "curve": curve}
-
-
-def _normalized(net_arch: Any) -> Any:
-    """:return: what SB3 can put behind each layer of the heads: LayerNorm, then ReLU"""
-    if not isinstance(net_arch, list) or len(set(net_arch)) != 1:
-        raise ValueError(f"net_arch={net_arch!r} with layer_norm: layers of one width are needed, for instance [256, 256]")
-    return lambda: nn.Sequential(nn.LayerNorm(net_arch[0]), nn.ReLU())

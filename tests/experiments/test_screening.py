@@ -32,7 +32,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[SAC]:
 
 def test_the_configurations_settings_are_trained_with(trained: list[SAC]) -> None:
     settings = read_settings(LAPTOP, "rad", "dmc_pixels/finger-spin-v0") | {"n_steps": 3, "reward_scale": 0.1}
-    measured = screened_state_sac("finger-spin", {**settings, "n_timesteps": 540}, evaluations=2, episodes=1)
+    measured = screened_state_sac("finger-spin", {**settings, "n_timesteps": 540}, evaluations=2, episodes=2)
     (model,) = trained
     assert (model.n_steps, model.batch_size, model.tau, model.gamma, model.buffer_size) == (3, 128, 0.02, 0.99, 50_000)
     assert model._n_updates == (540 - 500) / 2  # one for two decisions, from the end of the warm-up on
@@ -45,7 +45,7 @@ def test_the_configurations_settings_are_trained_with(trained: list[SAC]) -> Non
 
 def test_rewards_are_scaled_in_training_and_not_in_evaluations(trained: list[SAC]) -> None:
     settings = {"n_timesteps": 120, "learning_starts": 100, "reward_scale": 0.1}
-    returns = screened_state_sac("cartpole-balance", settings, evaluations=1, episodes=1)["curve"][0]["mean"]
+    returns = screened_state_sac("cartpole-balance", settings, evaluations=1, episodes=2)["curve"][0]["mean"]
     assert trained[0].replay_buffer is not None
     rewards = trained[0].replay_buffer.rewards[:120]
     assert rewards.max() <= 0.8 < 8 * rewards.max() < returns  # eight environment steps of at most 1 each, in 125 decisions
