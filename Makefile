@@ -24,7 +24,7 @@ train: rendering ## train CRC-RL on cartpole-swingup from pixels; more flags: ma
 	case $$status in 130|143) ;; *) exit $$status ;; esac # stopped by a signal, and saved: no failure
 
 test: rendering ## the fast tests, a few minutes on two cores
-	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)
+	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 --dist worksteal -m "not slow and not long" $(ARGS)
 
 test-slow: rendering ## the slow tests: real environments, real training runs
 	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 --dist worksteal -m "slow and not alone" $(ARGS) || [ $$? -eq 5 ] # 5: none
@@ -37,10 +37,10 @@ test-lowest: rendering ## the fast tests with the lowest allowed versions of all
 	.venv/bin/python -m venv --clear .venv-lowest
 	.venv/bin/uv pip compile -q -p .venv-lowest --resolution lowest-direct --all-extras pyproject.toml -o .venv-lowest/versions.txt
 	.venv-lowest/bin/python -m pip install -q --disable-pip-version-check -c .venv-lowest/versions.txt -e '$(EVERYTHING)'
-	@$(ONE_THREAD) .venv-lowest/bin/python -m pytest -n 2 -m "not slow and not long" $(ARGS)
+	@$(ONE_THREAD) .venv-lowest/bin/python -m pytest -n 2 --dist worksteal -m "not slow and not long" $(ARGS)
 
 coverage: rendering ## the lines of sb3_crc/ that the fast tests run; fails below 90 %
-	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 -m "not slow and not long" --cov $(ARGS)
+	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 --dist worksteal -m "not slow and not long" --cov $(ARGS)
 
 reproduce-quick: rendering ## one row of docs/results.md anew, about an hour on two idle cores, and compare
 	@.venv/bin/python -m sb3_crc compare --task cartpole-swingup --presets crc --seeds 1 --first-seed 21 --eval-every 20000 \

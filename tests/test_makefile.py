@@ -92,7 +92,7 @@ INSTALL = (
     "-m pip install --disable-pip-version-check -c constraints.txt -e .[zoo,video,track,analysis,cluster,onnx,bench,docs,dev]"
 )
 RENDERING = "-m sb3_crc rendering --install"
-FAST_TESTS = "-m pytest -n 2 -m not slow and not long"
+FAST_TESTS = "-m pytest -n 2 --dist worksteal -m not slow and not long"
 
 
 def test_installs_once_and_again_when_the_dependencies_change(checkout: Checkout) -> None:

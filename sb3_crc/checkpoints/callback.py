@@ -23,6 +23,8 @@ from sb3_crc.whole_rollouts import WholeRollouts
 
 #: File in the folder of a training that has ended
 DONE = "DONE"
+#: Name of the thread that writes a checkpoint
+THREAD = "checkpoint"
 
 
 class TrainingCheckpoint(BaseCallback):
@@ -70,7 +72,7 @@ class TrainingCheckpoint(BaseCallback):
         self.monitor_dir = None if monitor_dir is None else Path(monitor_dir)
         self._saved_at = 0
         self._lock = RunLock(Path(folder), self.close)
-        self._writer: ThreadPoolExecutor | None = None
+        self._begun = False
         self._writing: Future[Path] | None = None
         self._whole: Path | None = None
         #: The buffer that is being written, and its segments before
@@ -98,7 +100,7 @@ class TrainingCheckpoint(BaseCallback):
     def _on_training_start(self) -> None:
         if not self._lock.is_held:
             raise ValueError(f"{self.store.folder}: two TrainingCheckpoints of one training cannot share a folder")
-        self._writer = ThreadPoolExecutor(1, "checkpoint")
+        self._begun = True
         self._failures, self._saved_whole = 0, True
         endure(self.logger, self.training_env, self.monitor_dir)
         self._request = StopRequest()
@@ -175,7 +177,7 @@ class TrainingCheckpoint(BaseCallback):
             raise TrainingStopped(self.stopped_by)
 
     def _on_training_end(self) -> None:
-        if self._writer is None:  # rl_zoo3 calls this once more
+        if not self._begun:  # rl_zoo3 calls this once more
             return
         # Stopped by a callback, SB3 does not store the last step: what it was made of is gone
         whole = not self._in_rollout or isinstance(self.model, WholeRollouts)
@@ -207,17 +209,18 @@ class TrainingCheckpoint(BaseCallback):
         try:
             self._finish_writing()
         finally:
-            if self._writer is not None:
-                self._writer.shutdown()
-                self._writer = None
+            self._begun = False
             self._lock.release()
 
     def _save(self) -> None:
-        """Copy what is to be written, and leave the writing to another thread."""
+        """
+        Copy what is to be written, and leave the writing to another thread. That ends with its work: while a second thread has
+        OpenMP threads of its own, all of them sleep between two operations instead of waiting awake, and updates on several
+        cores take half as long again.
+        """
         self._finish_writing()
         buffer, steps = self.model.replay_buffer, self.model.num_timesteps
         assert isinstance(buffer, FrameReplayBuffer)
-        assert self._writer is not None
         self._saved_at, self._before = steps, (buffer, buffer.segments)
         try:
             replay = contents(buffer, self.store.segments, buffer.segments)
@@ -228,7 +231,9 @@ class TrainingCheckpoint(BaseCallback):
             self._tell_of(error)
             return
         buffer.segments = replay.segments
-        self._writing = self._writer.submit(self.store.save, steps, state, replay)
+        writer = ThreadPoolExecutor(1, THREAD)
+        self._writing = writer.submit(self.store.save, steps, state, replay)
+        writer.shutdown(wait=False)
 
     def _finish_writing(self) -> bool:
         """

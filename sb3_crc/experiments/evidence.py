@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_crc.experiments.comparison_summary import difference_table, markdown
 from sb3_crc.experiments.pairs import compare_by_task
-from sb3_crc.experiments.published import SIX_TASKS, read_published
+from sb3_crc.experiments.published import SIX_TASKS, published, read_published
 from sb3_crc.experiments.runs import read_json
 from sb3_crc.experiments.scores import BETWEEN, final_means, one_protocol, read_scores
 from sb3_crc.experiments.statistics import ENOUGH_SEEDS, HIGHEST_RETURN, NOT_RESOLVED, aggregate
@@ -30,6 +30,8 @@ BEST: dict[str, str] = {
     "cheetah-run": "Simoun",
     "walker-walk": "Simoun",
 }
+#: Columns of the published table that say where these scores lie
+OTHERS = ("MLR", "DrQ", "CURL", "SAC+AE", "pixel SAC", "state SAC")
 BUDGET = 100_000
 #: Of the bootstrap of a mean
 SAMPLES = 10_000
@@ -92,6 +94,13 @@ def goals(task: str) -> dict[str, float]:
     return {name: float(cells[name]) for name in (PAPER, BEST.get(task, PAPER)) if name in cells}
 
 
+def others(task: str) -> dict[str, float]:
+    """:param task: domain-task; :return: means that are published for :data:`OTHERS` at 100 000 environment steps, highest first"""
+    cells = published("100k")
+    cells = cells[(cells["task"] == task) & cells["column"].isin(OTHERS)]
+    return {str(name): float(mean) for name, mean in cells.sort_values("mean", ascending=False)[["column", "mean"]].to_numpy()}
+
+
 def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[float]]) -> Iterator[str]:
     wanted = goals(task)
     header = ["method", "seeds: return of each", "mean", "IQM", *(f"P(mean >= {value:.0f})" for value in wanted.values())]
@@ -108,8 +117,9 @@ def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[flo
     yield from [f"## {task}", "", *markdown(header, rows), ""]
     if wanted:
         cited = "; ".join(f"{value:.0f}: {name}" for name, value in wanted.items())
+        beside = ", ".join(f"{value:.0f}: {name}" for name, value in others(task).items())
         yield from _paragraph(
-            f"Published at {BUDGET:,} environment steps: {cited}. {PAPER}'s ± is over evaluation runs of an unstated number "
+            f"Published at {BUDGET:,} environment steps: {cited}; beside them {beside or 'nothing'}. {PAPER}'s ± is over evaluation runs of an unstated number "
             "of trainings, and whether its steps are environment steps is not certain. In parentheses: 95 % intervals, "
             f"bootstrap over seeds, which with few seeds are too narrow. P: share of {SAMPLES:,} bootstrap samples of the "
             f"seeds, from {ENOUGH_SEEDS} seeds on."

@@ -17,6 +17,7 @@ def test_segments_hold_each_frame_once_and_those_that_the_checkpoint_before_need
     assert costs.state > 10_000
 
 
+@pytest.mark.slow
 def test_a_row_is_judged() -> None:
     row = measure(networks=TINY, decisions=300, every=100)
     assert (row["networks"], row["decisions"], row["buffer"]) == ("tiny", 300, 300)

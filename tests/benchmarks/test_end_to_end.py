@@ -19,6 +19,7 @@ def test_every_part_takes_time(method: str) -> None:
     assert {part for part in PARTS if seconds[part] <= 0} == ({"augment"} if method == STOCK else set())
 
 
+@pytest.mark.slow
 def test_shares_make_the_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = measure(networks=TINY, presets=(), decisions=4, batch_size=16, render_quality="fast")
     milliseconds, shares = rows

@@ -26,7 +26,9 @@ def test_stock_is_timed_over_as_many_updates() -> None:
     assert matrix_peak(64, 3, th.bfloat16) > 0
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way", [pytest.param(way, marks=pytest.mark.slow if number else ()) for number, way in enumerate(WAYS)]
+)
 def test_a_decision_is_timed_with_its_update(way: str) -> None:
     seconds = seconds_per_decision("rad", way, "laptop", 8, 4, "cpu", "fast")
     assert 0.001 < seconds < 10

@@ -42,6 +42,7 @@ def results(output: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_a_dry_run_starts_nothing(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, command(tmp_path / "runs", "--dry-run", presets="rad"))
     assert done.exit_code == 0 and done.stdout.count("150 agent steps, to run") == 1

@@ -71,6 +71,7 @@ def test_ranges_of_numbers() -> None:
     assert [ranges(numbers) for numbers in ([3], [1, 2], [1, 2, 3], [0, 2, 3, 4, 5, 9])] == ["3", "1, 2", "1-3", "0, 2-5, 9"]
 
 
+@pytest.mark.slow
 def test_the_committed_runs_are_compared(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["curves", str(FINAL), "--baseline", "crc", "-o", str(tmp_path)])
     assert done.exit_code == 0, done.output

@@ -13,7 +13,20 @@ from sb3_crc.settings import check_name
 
 app = typer.Typer()
 
+LAPTOP = Path("zoo_configs/laptop.yml")
 RUNGS = ("state", "screen", "seen", "probe", "teach", "overfit")
+#: Options that only some rungs have
+OWN_OPTIONS = {
+    "--config": ("screen", "probe", "teach", "overfit"),
+    "--set": ("screen",),
+    "--reward-scale": ("state",),
+    "--error": ("seen",),
+    "--n-steps": ("seen",),
+    "--target-entropy": ("seen",),
+    "--falling-rates": ("seen",),
+    "--agent-steps": ("seen",),
+    "--evaluations": ("seen", "screen"),
+}
 
 
 @command(app, Group.TASKS, "sb3-crc baselines cartpole-swingup --episodes 5", "sb3-crc baselines walker-walk --json")
@@ -76,43 +89,51 @@ def ladder(
     task: Annotated[str, typer.Argument(help="domain-task.", autocompletion=completion.tasks)] = "cartpole-swingup",
     output: Annotated[Path | None, typer.Option(help="JSON file to write too.")] = None,
     config: Annotated[
-        Path,
+        Path | None,
         typer.Option(
-            help="Configuration of rl-zoo: its policy_kwargs in rungs probe, teach, overfit, its settings in screen."
+            help="Configuration of rl-zoo: its policy_kwargs in rungs probe, teach, overfit, its settings in screen; else "
+            f"{LAPTOP}."
         ),
-    ] = Path("zoo_configs/laptop.yml"),
+    ] = None,
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="name=value: another setting, rung screen; once for each.")
     ] = None,
-    reward_scale: Annotated[float, typer.Option(help="Factor on the rewards, rung state.")] = 1.0,
+    reward_scale: Annotated[float | None, typer.Option(help="Factor on the rewards, rung state; else 1.")] = None,
     error: Annotated[
         list[float] | None, typer.Option(help="Of what is read off a frame, in metres, rung seen; once for each; else 0.")
     ] = None,
     n_steps: Annotated[
         list[int] | None, typer.Option(help="Agent steps of the n-step return, rung seen; once for each; else 1.")
     ] = None,
-    target_entropy: Annotated[float, typer.Option(help="Of the policy, in nats, rung seen.")] = -1.0,
+    target_entropy: Annotated[float | None, typer.Option(help="Of the policy, in nats, rung seen; else -1.")] = None,
     falling_rates: Annotated[bool, typer.Option("--falling-rates", help="Learning rates that end at 0, rung seen.")] = False,
-    agent_steps: Annotated[int, typer.Option(min=600, help="Budget of each training in agent steps, rung seen.")] = 7_500,
-    evaluations: Annotated[int, typer.Option(min=1, help="How many in each training, rungs seen and screen.")] = 6,
+    agent_steps: Annotated[
+        int | None, typer.Option(min=600, help="Budget of each training in agent steps, rung seen; else 7500.")
+    ] = None,
+    evaluations: Annotated[
+        int | None, typer.Option(min=1, help="How many in each training: rung seen, else 6; rung screen, else 10.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
 ) -> object:
     """Measure what must work before learning from pixels can."""
     if rung not in RUNGS:
         raise typer.BadParameter(f"{rung!r} is none of {', '.join(RUNGS)}", param_hint="RUNG")
+    own: dict[str, Any] = {"reward_scale": reward_scale, "target_entropy": target_entropy, "agent_steps": agent_steps}
+    own |= {"falling_rates": falling_rates or None, "evaluations": evaluations}
+    own = {name: value for name, value in own.items() if value is not None}
+    _check_options(rung, {**own, "config": config, "set": changes, "error": error, "n_steps": n_steps})
+    config = config or LAPTOP
     policy_kwargs = _policy_kwargs(config, task) if rung in ("probe", "teach", "overfit") else {}
     encoder_kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
     from sb3_crc.experiments import ladder as rungs
 
     if rung == "state":
-        measured: Any = rungs.state_sac(task, reward_scale=reward_scale, seed=seed)
+        measured: Any = rungs.state_sac(task, seed=seed, **own)
     elif rung == "screen":
-        measured = _screened(config, task, changes or [], evaluations, seed)
+        measured = _screened(config, task, changes or [], seed=seed, **own)
     elif rung == "seen":
-        shared: dict[str, Any] = {"target_entropy": target_entropy, "falling_rates": falling_rates}
-        shared |= {"agent_steps": agent_steps, "evaluations": evaluations, "seed": seed}
         measured = [
-            rungs.seen_state_sac(task, error=one, n_steps=steps, **shared)
+            rungs.seen_state_sac(task, error=one, n_steps=steps, seed=seed, **own)
             for one in error or [0.0]
             for steps in n_steps or [1]
         ]
@@ -122,8 +143,8 @@ def ladder(
         measured = rungs.teach_encoder(task, encoder_kwargs, seed=seed)
     else:
         measured = [
-            rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=own, seed=seed)
-            for name, own in rungs.OVERFITTED
+            rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=settings, seed=seed)
+            for name, settings in rungs.OVERFITTED
         ]
     for name, value in _flat(measured):
         say(f"{name}: {value}")
@@ -131,7 +152,15 @@ def ladder(
     return measured
 
 
-def _screened(config: Path, task: str, changes: list[str], evaluations: int, seed: int) -> Mapping[str, Any]:
+def _check_options(rung: str, given: Mapping[str, Any]) -> None:
+    """:raises BadParameter: for an option that the rung would not heed"""
+    for name, value in given.items():
+        option = f"--{name.replace('_', '-')}"
+        if value not in (None, []) and rung not in OWN_OPTIONS[option]:
+            raise typer.BadParameter(f"{option} is an option of {' and '.join(OWN_OPTIONS[option])}; this is rung {rung}")
+
+
+def _screened(config: Path, task: str, changes: list[str], **own: Any) -> Mapping[str, Any]:
     import yaml
 
     from sb3_crc.configurations import read_settings, with_overrides
@@ -145,7 +174,7 @@ def _screened(config: Path, task: str, changes: list[str], evaluations: int, see
             raise typer.BadParameter(f"{change!r} is not name=value", param_hint="--set")
         check_name("--set", name, USED)
         settings = with_overrides(settings, {name: yaml.safe_load(value)})
-    return screened_state_sac(task, settings, evaluations=evaluations, seed=seed)
+    return screened_state_sac(task, settings, **own)
 
 
 def _policy_kwargs(config: Path, task: str) -> Mapping[str, Any]:
