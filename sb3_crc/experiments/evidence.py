@@ -95,7 +95,7 @@ def goals(task: str) -> dict[str, float]:
 
 
 def others(task: str) -> dict[str, float]:
-    """:param task: domain-task; :return: means that are published for :data:`OTHERS` at 100 000 environment steps, highest first"""
+    """:param task: domain-task; :return: what is published for :data:`OTHERS` at 100 000 environment steps, highest first"""
     cells = published("100k")
     cells = cells[(cells["task"] == task) & cells["column"].isin(OTHERS)]
     return {str(name): float(mean) for name, mean in cells.sort_values("mean", ascending=False)[["column", "mean"]].to_numpy()}
@@ -119,10 +119,10 @@ def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[flo
         cited = "; ".join(f"{value:.0f}: {name}" for name, value in wanted.items())
         beside = ", ".join(f"{value:.0f}: {name}" for name, value in others(task).items())
         yield from _paragraph(
-            f"Published at {BUDGET:,} environment steps: {cited}; beside them {beside or 'nothing'}. {PAPER}'s ± is over evaluation runs of an unstated number "
-            "of trainings, and whether its steps are environment steps is not certain. In parentheses: 95 % intervals, "
-            f"bootstrap over seeds, which with few seeds are too narrow. P: share of {SAMPLES:,} bootstrap samples of the "
-            f"seeds, from {ENOUGH_SEEDS} seeds on."
+            f"Published at {BUDGET:,} environment steps: {cited}; beside them {beside or 'nothing'}. {PAPER}'s ± is over "
+            "evaluation runs of an unstated number of trainings, and whether its steps are environment steps is not certain. "
+            "In parentheses: 95 % intervals, bootstrap over seeds, which with few seeds are too narrow. P: share of "
+            f"{SAMPLES:,} bootstrap samples of the seeds, from {ENOUGH_SEEDS} seeds on."
         )
 
 

@@ -48,8 +48,13 @@ class Watch(BaseCallback):
 
 
 def watched(folder: Path) -> Watch:
-    kwargs = {"net_arch": [256, 256], "features_extractor_kwargs": {"channels": [16, 16], "strides": [2, 2], "features_dim": 64}}
-    model = CRCSAC("CnnPolicy", NoiseEnv(size=64), seed=0, buffer_size=200, batch_size=64, learning_starts=65, policy_kwargs=kwargs)
+    kwargs = {
+        "net_arch": [256, 256],
+        "features_extractor_kwargs": {"channels": [16, 16], "strides": [2, 2], "features_dim": 64},
+    }
+    model = CRCSAC(
+        "CnnPolicy", NoiseEnv(size=64), seed=0, buffer_size=200, batch_size=64, learning_starts=65, policy_kwargs=kwargs
+    )
     checkpoint = TrainingCheckpoint(folder, every=80)
     watch = Watch(checkpoint)
     model.learn(92, callback=[checkpoint, watch])

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
-from sb3_crc.experiments.evidence import BEST, goals, probability_of_reaching, results_page
+from sb3_crc.experiments.evidence import BEST, OTHERS, goals, others, probability_of_reaching, results_page
 from sb3_crc.experiments.published import SIX_TASKS
 from sb3_crc.experiments.scores import COLUMNS
 
@@ -115,3 +115,13 @@ def test_goals_are_published_figures() -> None:
     assert [round(values[0]) for values in found.values()] == [813, 636, 355, 832, 793, 490]
     assert [round(values[1]) for values in found.values()] == [851, 917, 518, 971, 981, 869]
     assert set(BEST) == set(SIX_TASKS) and goals("humanoid-run") == {}
+
+
+def test_what_is_published_beside_the_goals_is_sorted() -> None:
+    assert others("cartpole-swingup") == {
+        **{"state SAC": 835, "MLR": 806, "DrQ": 759, "CURL": 582},
+        **{"pixel SAC": 419, "SAC+AE": 311},
+    }
+    for task in SIX_TASKS:
+        means = list(others(task).values())
+        assert set(others(task)) == set(OTHERS) and means == sorted(means, reverse=True)
