@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from sb3_crc.configurations import CONFIGS, configuration_file, read_settings, settings_for, shipped, with_overrides
+from sb3_crc.envs.tasks import default_action_repeat, environment_id
+from sb3_crc.experiments.published import SIX_TASKS
 from sb3_crc.stock import shared_settings
 
 ENV = "dmc_pixels/cartpole-swingup-v0"
@@ -204,3 +206,11 @@ def test_the_projects_own_are_found_from_anywhere(monkeypatch: pytest.MonkeyPatc
     laptop.parent.mkdir()
     laptop.write_text("default: {batch_size: 7}\n", encoding="utf-8")
     assert read_settings(laptop, "rad", "dmc_pixels/cartpole-swingup-v0") == {"batch_size": 7}  # one's own comes first
+
+
+@pytest.mark.parametrize("task", SIX_TASKS)
+def test_the_laptop_class_has_one_budget_for_each_task(task: str) -> None:
+    settings = read_settings(Path("zoo_configs/laptop.yml"), "crc", environment_id(task))
+    decisions = settings["n_timesteps"]
+    assert decisions * default_action_repeat(task) == 100_000 and settings["buffer_size"] >= decisions
+    assert decisions * settings["gradient_steps"] / settings["train_freq"] == 25_000
