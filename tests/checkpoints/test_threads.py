@@ -1,6 +1,5 @@
 """Updates are as fast after a checkpoint as before."""
 
-import os
 import resource
 import threading
 import time
@@ -68,7 +67,6 @@ def test_the_thread_that_writes_ends_with_its_work(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
 def test_threads_of_updates_stay_awake(tmp_path: Path) -> None:
     """With OpenMP threads of two threads of Python each would sleep after each operation, some hundred times in an update."""
     th.set_num_threads(2)
