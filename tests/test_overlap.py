@@ -49,7 +49,7 @@ def environments(kind: Callable[[list[Any]], VecEnv], n_envs: int, make: Any = f
     return VecFrameStack(kind([make] * n_envs), 3, channels_order="first")
 
 
-def trained(env: VecEnv, *, steps: int = 40, **own: Any) -> tuple[CRCSAC, Watch]:
+def trained(env: VecEnv, *, steps: int = 60, **own: Any) -> tuple[CRCSAC, Watch]:
     settings: dict[str, Any] = {
         **{"batch_size": 8, "buffer_size": 40, "learning_starts": 16, "gradient_steps": 2, "seed": 3},
         **{"learning_rate": "lin_0.001", "policy_kwargs": POLICY_KWARGS},

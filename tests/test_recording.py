@@ -52,7 +52,10 @@ class Tracer:
 class Direct:
     """Does the work anew each time, on the memory of the recording."""
 
+    made = 0
+
     def __call__(self, work: Callable[[], Metrics]) -> tuple[Replay, Metrics]:
+        self.made += 1
         results: Metrics = {}
 
         def replay() -> None:
@@ -139,11 +142,12 @@ def test_an_update_with_longer_returns_is_another_one(record: Any) -> None:
 
 
 def test_the_first_updates_are_made_as_ever_and_then_one_of_each_kind_is_recorded() -> None:
-    model = recorded(Direct(), policy_delay=2, target_update_interval=2)
+    recorder = Direct()
+    model = recorded(recorder, policy_delay=2, target_update_interval=2)
     counts = []
     for _ in range(12):
         model.train(gradient_steps=1, batch_size=16)
-        counts.append(len(model._recorded._recordings))  # type: ignore[union-attr]
+        counts.append(recorder.made)
     assert counts == [0] * (2 * WARM_UP) + [1] + [2] * 5
 
 
@@ -198,7 +202,7 @@ def test_another_shape_of_the_batch_is_another_recording() -> None:
 
 
 def test_given_parameters_are_trained_on() -> None:
-    model, other = recorded(Direct()), make_model(seed=1)
+    model, other = recorded(policy_delay=1, target_update_interval=1), make_model(seed=1)
     model.train(gradient_steps=8, batch_size=16)
     other.train(gradient_steps=2, batch_size=16)
     model.set_parameters(other.get_parameters(), device="cpu")
