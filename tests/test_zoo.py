@@ -124,6 +124,19 @@ def test_yaml_env_kwargs_reach_the_evaluation_environment(tmp_path: Path) -> Non
         model.env.close()
 
 
+def test_runs_that_begin_at_the_same_moment_have_a_folder_each(tmp_path: Path) -> None:
+    """rl_zoo3 names a run's folder long before it makes it."""
+    managers = [CRCExperimentManager(Namespace(), "crc", ENV, str(tmp_path), verbose=0) for _ in range(3)]
+    assert len({manager.save_path for manager in managers}) == 1
+    for manager in managers:
+        manager.create_log_folder()
+    name = "dmc_pixels-cartpole-swingup-v0"
+    runs = [tmp_path / "crc" / f"{name}_{number}" for number in (1, 2, 3)]
+    assert [Path(manager.save_path) for manager in managers] == runs
+    assert [Path(manager.params_path) for manager in managers] == [run / name for run in runs]
+    assert all((run / name).is_dir() for run in runs)
+
+
 def test_a_configuration_may_hold_what_one_preset_has_beside_the_others(tmp_path: Path) -> None:
     shared = {"n_timesteps": 10, "policy": "CnnPolicy", "batch_size": 8, "tau": 0.1, "gamma": 0.9}
     config = tmp_path / "config.yml"

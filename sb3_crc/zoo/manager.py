@@ -18,7 +18,7 @@ import yaml
 from filelock import FileLock
 from optuna.trial import TrialState
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import SimpleLinearSchedule
+from rl_zoo3.utils import SimpleLinearSchedule, get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
 from stable_baselines3.common.utils import LinearSchedule, configure_logger
@@ -118,6 +118,18 @@ class CRCExperimentManager(ExperimentManager):
         return processed
 
     # -- Training ------------------------------------------------------------------------------------------------------
+
+    def create_log_folder(self) -> None:
+        """As in the zoo, but runs that are begun at the same moment get a folder each: it may be taken since it was named."""
+        while self.plan.run is None:
+            try:
+                os.makedirs(self.save_path)
+                break
+            except FileExistsError:
+                number = get_latest_run_id(self.log_path, self.env_name) + 1
+                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
+        self.params_path = os.path.join(self.save_path, str(self.env_name))
+        os.makedirs(self.params_path, exist_ok=True)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """Train until done or interrupted (Ctrl-C), logging to ``progress.csv`` and TensorBoard."""
