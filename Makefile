@@ -42,7 +42,7 @@ test-lowest: rendering ## the fast tests with the lowest allowed versions of all
 coverage: rendering ## the lines of sb3_crc/ that the fast tests run; fails below 90 %
 	@$(ONE_THREAD) .venv/bin/python -m pytest -n 2 --dist worksteal -m "not slow and not long" --cov $(ARGS)
 
-reproduce-quick: rendering ## one row of docs/results.md anew, about an hour on two idle cores, and compare
+reproduce-quick: rendering ## one row of docs/results.md anew, 70 minutes on two idle cores, and compare
 	@.venv/bin/python -m sb3_crc compare --task cartpole-swingup --presets crc --seeds 1 --first-seed 21 --eval-every 20000 \
 	  --conf-file zoo_configs/laptop.yml -o reproduction --jobs 1 $(ARGS)
 	@.venv/bin/python -m sb3_crc reproduced reproduction results/laptop/final
