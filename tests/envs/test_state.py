@@ -155,9 +155,8 @@ def test_the_papers_tasks_continue_exactly_over_episodes(task: str, moment: str)
         over = step_randomly(env, 1000)
         assert over
     other = restored(env, task, **SMALL)
-    # From within an episode, or from its end, well into the next one
-    whole_episode = 1000 // env.action_repeat if moment in ("middle", "end") else 0
-    assert_same_future(env, other, whole_episode + 60, over=over)
+    whole_episode = 1000 // env.action_repeat
+    assert_same_future(env, other, whole_episode + 60, over=over)  # well into the next episode
     for _ in range(2):
         assert_same_future(env, other, 3, over=True)
     for e in (env, other):
