@@ -37,22 +37,25 @@ BUDGET = 100_000
 SAMPLES = 10_000
 
 
-def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | None = None, trials: Sequence[Path] = ()) -> str:
+def results_page(
+    sources: Sequence[Path], *, baselines: Sequence[str], landmarks: Path | None = None, trials: Sequence[Path] = ()
+) -> str:
     """
     :param sources: CSV files of scores, or folders that contain runs
-    :param baseline: method with which the others are compared
+    :param baselines: methods with each of which the others are compared
     :param landmarks: file of ``sb3-crc landmarks``
     :param trials: tables of the trials that led to the settings
     :return: Markdown. The same files give the same page
     :raises FileNotFoundError: if a file does not exist
-    :raises ValueError: if there are no final scores, episodes are missing, or they do not belong together
+    :raises ValueError: if final scores, or those of a baseline, are not there, episodes are missing, or scores do not match
     """
     scores = read_scores(sources)
     final = scores.final
     if final.empty:
         raise ValueError(f"there is no score of a final policy in {', '.join(map(str, sources))}")
     means = final_means(one_protocol(final, remedy=""))
-    check_name("baseline", baseline, list(dict.fromkeys(means["method"])))
+    for baseline in baselines:
+        check_name("baseline", baseline, list(dict.fromkeys(means["method"])))
     lines = ["# Results", ""]
     lines += _paragraph(
         "Made by `sb3-crc results` from raw files alone; do not edit. Every figure is the return of the FINAL policy after "
@@ -62,7 +65,7 @@ def results_page(sources: Sequence[Path], *, baseline: str, landmarks: Path | No
     measured = {} if landmarks is None else read_json(landmarks)["returns"]
     for task in dict.fromkeys(means["task"]):
         lines += _task(task, means[means["task"] == task], measured.get(task, {}))
-    lines += _compared(means, baseline)
+    lines += _compared(means, list(dict.fromkeys(baselines)))
     lines += _conditions(final)
     if trials:
         lines += _trials(trials)
@@ -126,17 +129,19 @@ def _task(task: str, means: "pd.DataFrame", landmarks: Mapping[str, Sequence[flo
         )
 
 
-def _compared(means: "pd.DataFrame", baseline: str) -> Iterator[str]:
-    found, left_out = compare_by_task(means, baseline)
-    if not found:
+def _compared(means: "pd.DataFrame", baselines: Sequence[str]) -> Iterator[str]:
+    compared = {baseline: compare_by_task(means, baseline) for baseline in baselines}
+    if not any(found for found, _ in compared.values()):
         return
-    yield from [f"## Against {baseline}", "", *difference_table(found), ""]
+    for baseline, (found, _) in compared.items():
+        if found:
+            yield from [f"## Against {baseline}", "", *difference_table(found), ""]
     yield from _paragraph(
         "A row for each task, with all seeds that the method and the baseline both have on it. "
         f"'{NOT_RESOLVED}': the interval of the difference, paired by seed, includes 0, or there are fewer than "
         f"{ENOUGH_SEEDS} seeds."
     )
-    if left_out:
+    if left_out := dict.fromkeys(one for _, absent in compared.values() for one in absent):
         yield from ["In no row:", "", *(f"- {one}" for one in left_out), ""]
 
 

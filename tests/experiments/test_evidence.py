@@ -38,7 +38,7 @@ def test_the_committed_page_is_what_the_raw_files_give(monkeypatch: pytest.Monke
     results = Path("results")
     page = results_page(
         [results / "laptop" / "final"],
-        baseline="crc",
+        baselines=["crc", "rad"],
         landmarks=results / "landmarks.json",
         trials=[results / "laptop" / "trials.csv", results / "laptop" / "final.csv"],
     )
@@ -47,7 +47,7 @@ def test_the_committed_page_is_what_the_raw_files_give(monkeypatch: pytest.Monke
 
 def test_every_seed_is_shown_and_what_was_not_done(tmp_path: Path) -> None:
     files = [scores(tmp_path / "a.csv", "crc", {0: 800, 1: 860, 2: 900}), scores(tmp_path / "b.csv", "rad", {0: 700, 1: 860})]
-    page = results_page(files, baseline="rad")
+    page = results_page(files, baselines=["rad"])
     assert "| crc | 0: 800, 1: 860, 2: 900 | 853 (" in page and "| rad | 0: 700, 1: 860 | 780 (" in page
     assert (
         "rad on cartpole-swingup, seed 2: absent" in page and "- no run on walker-walk" in page and "- no run of drq" in page
@@ -60,10 +60,23 @@ def test_every_seed_is_shown_and_what_was_not_done(tmp_path: Path) -> None:
 
 def test_each_method_is_compared_on_the_seeds_that_it_shares_with_the_baseline(tmp_path: Path) -> None:
     returns = {"crc": {0: 800, 1: 860, 2: 900}, "rad": {0: 700, 1: 860, 2: 950}, "sac": {1: 100}}
-    page = results_page([scores(tmp_path / f"{name}.csv", name, own) for name, own in returns.items()], baseline="crc")
+    page = results_page([scores(tmp_path / f"{name}.csv", name, own) for name, own in returns.items()], baselines=["crc"])
     assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page  # one seed of stock SAC costs rad none
     assert "| sac | cartpole-swingup | 1 | -760 | not resolved (one seed" in page
     assert "- sac on cartpole-swingup: no sac with seed 0, 2" in page
+
+
+def test_methods_are_compared_with_each_baseline_that_is_named(tmp_path: Path) -> None:
+    returns = {"crc": {0: 800, 1: 860, 2: 900}, "rad": {0: 700, 1: 860, 2: 950}, "sac": {1: 100}}
+    sources = [str(scores(tmp_path / f"{name}.csv", name, own)) for name, own in returns.items()]
+    page = tmp_path / "page.md"
+    named = ["--baseline", "crc", "--baseline", "rad", "--baseline", "crc"]
+    assert CliRunner().invoke(app, ["results", *sources, *named, "-o", str(page)]).exit_code == 0
+    crc, rad = page.read_text(encoding="utf-8").split("## Against ")[1:]
+    assert crc.startswith("crc\n") and "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in crc
+    assert rad.startswith("rad\n") and "| crc | cartpole-swingup | 0, 1, 2 | +17 (" in rad
+    assert "| sac | cartpole-swingup | 1 | -760 |" in crc and "| sac | cartpole-swingup | 1 | -760 |" in rad
+    assert rad.count("- sac on cartpole-swingup: no sac with seed 0, 2") == 1 and "In no row" not in crc
 
 
 def test_one_seed_on_another_task_costs_no_seeds(tmp_path: Path) -> None:
@@ -76,7 +89,7 @@ def test_one_seed_on_another_task_costs_no_seeds(tmp_path: Path) -> None:
             ("rad", "finger-spin", {0: 200, 1: 210}),
         )
     ]
-    page = results_page(files, baseline="crc")
+    page = results_page(files, baselines=["crc"])
     assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page
     assert "| rad | finger-spin | 0 | -100 | not resolved (one seed" in page
     assert "- rad on finger-spin: no crc with seed 1" in page
@@ -96,7 +109,7 @@ def test_all_trials_before_are_counted_with_their_seeds(tmp_path: Path) -> None:
 
 def test_pages_of_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no score of a final policy"):
-        results_page([tmp_path], baseline="rad")
+        results_page([tmp_path], baselines=["rad"])
     path = scores(tmp_path / "a.csv", "crc", {0: 800})
     done = CliRunner().invoke(app, ["results", str(path), "--baseline", "red", "-o", str(tmp_path / "page.md")])
     assert done.exit_code == 2 and "unknown baseline 'red'" in done.stderr and not (tmp_path / "page.md").exists()

@@ -32,16 +32,21 @@ def trials(
     return {"file": output, "trials": rows}
 
 
-@command(app, Group.EVIDENCE, "sb3-crc results results/laptop/final --baseline crc --landmarks results/landmarks.json")
+@command(app, Group.EVIDENCE, "sb3-crc results results/laptop/final --baseline crc --baseline rad")
 def results(
     sources: Annotated[
         list[Path],
         typer.Argument(help="CSV files of scores, or folders that contain runs.", autocompletion=completion.runs),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Markdown file to write.")] = Path("results.md"),
-    baseline: Annotated[
-        str, typer.Option(help="The method that others are compared with.", autocompletion=completion.methods)
-    ] = "rad",
+    baselines: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            help="A method that the others are compared with, once for each; else rad.",
+            autocompletion=completion.methods,
+        ),
+    ] = None,
     landmarks_file: Annotated[
         Path | None, typer.Option("--landmarks", help="JSON file of `sb3-crc landmarks`; else they are not in it.")
     ] = None,
@@ -53,7 +58,7 @@ def results(
     """What scores show and what they do not, as a page: each seed, chances to reach what is published, what was not done."""
     from sb3_crc.experiments.evidence import results_page
 
-    page = results_page(sources, baseline=baseline, landmarks=landmarks_file, trials=trials or ())
+    page = results_page(sources, baselines=baselines or ["rad"], landmarks=landmarks_file, trials=trials or ())
     output.write_text(page, encoding="utf-8")
     say(str(output))
     return {"written": [output]}
