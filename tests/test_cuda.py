@@ -24,28 +24,20 @@ def exact() -> Iterator[None]:
     th.backends.cudnn.allow_tf32 = before
 
 
-def losses(model: CRCSAC) -> dict[str, float]:
-    return {
-        name: value
-        for name, value in model.logger.name_to_value.items()
-        if name.startswith(("train/critic_loss", "representation/")) and "dead" not in name and "rank" not in name
-    }
-
-
 @pytest.mark.parametrize("preset", PRESETS)
-def test_losses_on_a_gpu_are_those_on_a_cpu(preset: str) -> None:
+def test_losses_on_a_gpu_are_those_on_a_cpu(preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.distributions.Normal, "rsample", lambda self, shape=(): self.loc)  # devices draw other actions
     models = [make_model(device=device, **PRESET_SETTINGS[preset]) for device in ("cpu", "cuda")]
     models[1].policy.load_state_dict(models[0].policy.state_dict())
     for model in models:
-        model.ent_coef_optimizer, model.log_ent_coef, model.ent_coef_tensor = None, None, th.zeros((), device=model.device)
-        th.manual_seed(0)
+        model.set_random_seed(1)
+        model.auxiliary_interval, model.reencode = 1, False  # Adam's first step makes much of the last digits
         model.train(gradient_steps=1, batch_size=16)
-    if preset == "sac_ae":  # its target is dithered by noise of the device
-        return
-    cpu, cuda = map(losses, models)
-    for name in ("train/critic_loss", *(f"representation/{name}" for name in models[0].policy.objectives)):
-        if name != "train/critic_loss":
-            assert cuda[name] == pytest.approx(cpu[name], rel=1e-4), name
+    cpu, cuda = (model.logger.name_to_value for model in models)
+    objectives = models[0].policy.objectives.items()
+    same = [f"representation/{name}" for name, objective in objectives if getattr(objective, "bits", None) is None]
+    for name in ("train/critic_loss", *same):  # what is painted with fewer bits has noise of the device in it
+        assert cuda[name] == pytest.approx(cpu[name], rel=1e-4), name
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -53,8 +45,7 @@ def test_losses_on_a_gpu_are_those_on_a_cpu(preset: str) -> None:
 def test_recorded_updates_are_those_that_are_launched_one_by_one(preset: str, precision: str) -> None:
     models = [make_model(device="cuda", compile=on, precision=precision, **PRESET_SETTINGS[preset]) for on in (False, True)]
     for model in models:
-        th.manual_seed(1)
-        th.cuda.manual_seed(1)
+        model.set_random_seed(1)  # numpy's too, with which batches are drawn
         model.train(gradient_steps=16, batch_size=16)
     assert models[1]._recorded is not None and models[1]._recorded._recordings
     for one, other in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
@@ -80,8 +71,7 @@ def test_frames_in_the_hosts_memory_train_the_same() -> None:
     models = [make_model(device="cuda", replay_device=place) for place in ("model", "cpu")]
     assert [model.replay_buffer.frame_device.type for model in models] == ["cuda", "cpu"]  # type: ignore[union-attr]
     for model in models:
-        th.manual_seed(1)
-        th.cuda.manual_seed(1)
+        model.set_random_seed(1)  # numpy's too, with which batches are drawn
         model.train(gradient_steps=4, batch_size=16)
     for one, other in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
         th.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
