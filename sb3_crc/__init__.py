@@ -80,7 +80,10 @@ def __getattr__(name: str) -> Any:
         home = next((module for module, names in _HOMES.items() if name in names), None)
         if home is None:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{__name__}.{home}"), name)
+        try:
+            value = getattr(import_module(f"{__name__}.{home}"), name)
+        except AttributeError as error:  # of a dependency: Python would take it for one of ours, and say that ours is missing
+            raise ImportError(f"cannot import {name!r}: {error}") from error
     globals()[name] = value
     return value
 

@@ -1,6 +1,7 @@
 """What is installed fits together, and importing the package stays light."""
 
 import ast
+import os
 import statistics
 import subprocess
 import sys
@@ -44,6 +45,15 @@ def test_public_names_are_imported_when_they_are_asked_for() -> None:
     assert homes == {name: home for home, names in sb3_crc._HOMES.items() for name in names}
     assert set(homes) == set(sb3_crc.__all__) and set(homes) < set(dir(sb3_crc))
     assert not hasattr(sb3_crc, "CRCSACK")
+
+
+def test_a_broken_dependency_is_named(tmp_path: Path) -> None:
+    """SB3 sets an option of OpenCV as soon as there is a module of that name."""
+    (tmp_path / "cv2.py").write_text("")
+    code = "from sb3_crc import CRCSAC"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert result.stderr.splitlines()[-1] == "ImportError: cannot import 'CRCSAC': module 'cv2' has no attribute 'ocl'"
 
 
 def test_importing_every_public_name_loads_nothing_optional() -> None:
