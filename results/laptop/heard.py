@@ -8,10 +8,12 @@ the last. Printed and saved: the distance of where the encoder's weights get fro
 way there.
 
     python results/laptop/heard.py RUN -o results/laptop/heard.json
+    python results/laptop/heard.py RUN --balance grad_norm -o results/laptop/heard_balanced.json
 """
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ from stable_baselines3.common.logger import Logger
 from sb3_crc import CRCSAC
 from sb3_crc.buffers.files import read_contents
 from sb3_crc.checkpoints.store import INDEX, CheckpointStore
+from sb3_crc.crc_sac import CHOICES
 
 AFTER = (1, 3, 10, 30, 100, 200)
 
@@ -54,8 +57,12 @@ def ways(model: CRCSAC, after: tuple[int, ...] = AFTER, *, without: str = "", nu
     return th.stack(places[1:]) - places[0]
 
 
-def loaded(run: Path) -> CRCSAC:
-    """:param run: folder of a training; :return: its model with what it had seen, half-way as far as learning rates go"""
+def loaded(run: Path, balance: str) -> CRCSAC:
+    """
+    :param run: folder of a training
+    :param balance: as CRCSAC's, whatever the training had
+    :return: its model with what it had seen, half-way as far as learning rates go
+    """
     checkpoints = CheckpointStore(run / "checkpoints")
     newest = checkpoints.newest()
     (path,) = run.glob("*-v*.zip")
@@ -64,6 +71,7 @@ def loaded(run: Path) -> CRCSAC:
         raise SystemExit(f"{run} has no checkpoint")
     read_contents(model.replay_buffer, checkpoints.segments, newest.path / INDEX)
     model._current_progress_remaining = 0.5
+    model.balance = balance
     return model
 
 
@@ -72,13 +80,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--balance", choices=CHOICES["balance"], default="none")
     options = parser.parse_args()
-    as_it_was = ways(loaded(options.run))
-    changes = {f"without {name}": {"without": name} for name in loaded(options.run).objectives}
+    begin = partial(loaded, options.run, options.balance)
+    as_it_was = ways(begin())
+    changes = {f"without {name}": {"without": name} for name in begin().objectives}
     changes |= {"weights differ by 1e-7": {"nudge": 1e-7}, "other crops": {"seed": 1}}
     shares = {}
     for name, change in changes.items():
-        distance = (ways(loaded(options.run), **change) - as_it_was).norm(dim=1) / as_it_was.norm(dim=1)
+        distance = (ways(begin(), **change) - as_it_was).norm(dim=1) / as_it_was.norm(dim=1)
         shares[name] = {str(updates): round(share, 4) for updates, share in zip(AFTER, distance.tolist(), strict=True)}
         print(name, shares[name], flush=True)
     options.output.write_text(json.dumps(shares, indent=1) + "\n")

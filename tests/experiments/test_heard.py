@@ -44,3 +44,6 @@ def test_the_page_has_what_was_measured() -> None:
     assert len(measured) == 5
     for shares in measured.values():
         assert " | ".join(f"{share:.4f}" for share in shares.values()) in page
+    balanced = json.loads(SCRIPT.with_name("heard_balanced.json").read_text())
+    for name in ("without contrastive", "without reconstruction", "without consistency", "weights differ by 1e-7"):
+        assert f" {balanced[name]['200']:.4f} " in page.replace("\n", " ")
