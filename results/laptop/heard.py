@@ -49,12 +49,16 @@ def ways(model: CRCSAC, after: tuple[int, ...] = AFTER, *, without: str = "", nu
             parameter.mul_(1 + nudge * th.randn_like(parameter))
     np.random.seed(0)
     th.manual_seed(seed)
-    places = []
+    begin, moved = flat(parameters), []
     for updates in np.diff((0, *after)):
-        places.append(th.cat([parameter.detach().flatten() for parameter in parameters]))
         model.train(int(updates), model.batch_size)
-    places.append(th.cat([parameter.detach().flatten() for parameter in parameters]))
-    return th.stack(places[1:]) - places[0]
+        moved.append(flat(parameters) - begin)
+    return th.stack(moved)
+
+
+def flat(parameters: list[th.nn.Parameter]) -> th.Tensor:
+    """:return: a copy of all of them in one row, however they lie in memory"""
+    return th.cat([parameter.detach().flatten() for parameter in parameters])
 
 
 def loaded(run: Path, balance: str) -> CRCSAC:
