@@ -28,6 +28,7 @@ from sb3_crc.crc_sac import CRCSAC
 from sb3_crc.encoder import PixelEncoder
 from sb3_crc.envs.dmc import make_dmc
 from sb3_crc.experiments.seen_positions import SeenPositions
+from sb3_crc.export import environment_of, load_policy
 from sb3_crc.schedules import lr_schedule
 
 #: SB3's SAC from states, with the replay ratio of the laptop class
@@ -39,6 +40,8 @@ OVERFITTED: tuple[tuple[str, dict[str, Any]], ...] = (
     ("reconstruction", {}),
     ("reconstruction", {"target": "clean", "half_size": True, "standardize": True}),
 )
+#: Of the actions of an episode, in turn, where a policy leads to the frames that an encoder is taught
+RANDOM_SHARES = (0.0, 0.15, 0.4, 0.8)
 #: Ridge penalties that the probe tries, on standardised inputs
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
@@ -165,7 +168,7 @@ def probe_random_encoder(
     :param seed: of environment, actions and weights
     :return: R^2 on held-out frames, by what is looked at and by the name of the task's observation (mean over its coordinates)
     """
-    images, states = _random_frames(task, frames, image_size, seed)
+    images, states = _frames(task, frames, image_size, seed)
     th.manual_seed(seed)
     encoder = PixelEncoder(spaces.Box(0, 255, images.shape[1:], np.uint8), **encoder_kwargs)
     with th.no_grad():
@@ -186,6 +189,7 @@ def teach_encoder(
     learning_rate: float = 1e-3,
     pad: int = 3,
     image_size: int = 64,
+    policy: str | Path | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
     """
@@ -194,15 +198,19 @@ def teach_encoder(
     :param task: as for :func:`~sb3_crc.make_dmc`
     :param encoder_kwargs: arguments of :class:`~sb3_crc.PixelEncoder`
     :param updates: of encoder and a linear head, on the mean squared error of the standardised state
-    :param frames: stacks that are collected with random actions; the last fifth, later episodes, is held out
+    :param frames: stacks that are collected; the last fifth, later episodes, is held out
     :param batch_size: frames per update
     :param learning_rate: of Adam
     :param pad: of the random shift
     :param image_size: side of the frames in pixels, drawn in the fast quality
+    :param policy: exported policy that acts, its actions mixed with random ones (:data:`RANDOM_SHARES`), so that the frames
+        are of all that an agent comes to see, and ``image_size`` and quality the policy's; None: random actions alone
     :param seed: of environment, actions and weights
-    :return: R^2 on held-out frames by the name of the task's observation (mean over its coordinates)
+    :return: R^2 on held-out frames by the name of the task's observation (mean over its coordinates), and root mean squared
+        error of each coordinate, in its unit
+    :raises ValueError: if the policy is one for another task
     """
-    images, states = _random_frames(task, frames, image_size, seed)
+    images, states = _frames(task, frames, image_size, seed, policy)
     split = round(0.8 * frames)
     targets = np.concatenate([values.reshape(frames, -1) for values in states.values()], axis=1)
     mean, std = targets[:split].mean(axis=0), targets[:split].std(axis=0) + 1e-6
@@ -224,7 +232,11 @@ def teach_encoder(
     scores = 1 - ((predicted - held_out) ** 2).mean(axis=0) / held_out.var(axis=0).clip(1e-8)
     sizes = np.cumsum([values.reshape(frames, -1).shape[1] for values in states.values()])[:-1]
     r2 = {name: float(part.mean()) for name, part in zip(states, np.split(scores, sizes), strict=True)}
-    return {"task": task, "seed": seed, "frames": frames, "updates": updates, "encoder": dict(encoder_kwargs), "r2": r2}
+    errors = np.sqrt(((predicted - held_out) ** 2).mean(axis=0)) * std
+    rmse = {name: part.tolist() for name, part in zip(states, np.split(errors, sizes), strict=True)}
+    acting = {} if policy is None else {"policy": Path(policy).as_posix()}
+    about = {"task": task, "seed": seed, "frames": frames, "updates": updates, **acting, "encoder": dict(encoder_kwargs)}
+    return {**about, "r2": r2, "rmse": rmse}
 
 
 def linear_probe(inputs: np.ndarray, targets: np.ndarray, *, held_out: float = 0.2) -> float:
@@ -312,15 +324,31 @@ def overfit_one_batch(
     }
 
 
-def _random_frames(task: str, frames: int, image_size: int, seed: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    env = make_dmc(task, image_size=image_size, render_quality="fast", observation="dict", seed=seed)
+def _frames(
+    task: str, frames: int, image_size: int, seed: int, policy: str | Path | None = None
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """:raises ValueError: if the policy is one for another task"""
+    drawing: dict[str, Any] = {"image_size": image_size, "render_quality": "fast"}
+    agent = None
+    if policy is not None:
+        own_task, drawing = environment_of(policy)
+        if own_task != task:
+            raise ValueError(f"{policy} is a policy for {own_task}, not for {task}")
+        agent = load_policy(policy, device="cpu")
+    env = make_dmc(task, **{**drawing, "observation": "dict"}, seed=seed)
+    rng = np.random.default_rng(seed)
     observations = []
     observation, _ = env.reset()
+    episode = 0
     for _ in range(frames):
         observations.append(observation)
-        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        action = env.action_space.sample()
+        if agent is not None and rng.random() >= RANDOM_SHARES[episode % len(RANDOM_SHARES)]:
+            action, _ = agent.predict(observation["pixels"])
+        observation, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
             observation, _ = env.reset()
+            episode += 1
     env.close()
     states = {key: np.stack([o[key] for o in observations]) for key in observations[0] if key != "pixels"}
     return np.stack([o["pixels"] for o in observations]), states

@@ -8,8 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from sb3_crc.cli import app
-from sb3_crc.experiments.ladder import linear_probe, overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
+from sb3_crc.experiments.ladder import _frames, linear_probe, overfit_one_batch, probe_random_encoder, state_sac, teach_encoder
 
+BEST = Path(__file__).parents[2] / "results/laptop/final/cartpole-swingup/rad/seed_23/policy.sb3crc"
 SMALL = {"channels": [8, 8], "strides": [2, 2], "features_dim": 16}
 
 
@@ -35,6 +36,19 @@ def test_a_taught_encoder_sees_more_than_an_untrained_one() -> None:
     assert measured[150]["position"] > max(measured[1]["position"], 0.3)
 
 
+def test_a_policy_leads_to_frames_that_random_actions_do_not_reach() -> None:
+    """From its frames an encoder is taught the whole swing; the errors are in the task's units, of each coordinate."""
+    taught = teach_encoder("cartpole-swingup", SMALL, updates=40, frames=130, image_size=36, policy=BEST)
+    assert [len(taught["rmse"][name]) for name in ("position", "velocity")] == [3, 2]
+    assert 0 < taught["rmse"]["position"][1] < 1  # the cosine of the pole's angle
+    assert taught["policy"] == BEST.as_posix()
+    _, by_policy = _frames("cartpole-swingup", 125, 36, 0, BEST)
+    _, by_chance = _frames("cartpole-swingup", 125, 36, 0)
+    assert by_policy["position"][-50:, 1].min() > 0.9 and by_chance["position"][-50:, 1].min() < 0  # the pole's height
+    with pytest.raises(ValueError, match="policy for cartpole-swingup, not for finger-spin"):
+        teach_encoder("finger-spin", SMALL, frames=250, policy=BEST)
+
+
 def test_state_sac_reports_its_curve() -> None:
     measured = state_sac("cartpole-swingup", agent_steps=520, evaluations=2, episodes=2)
     assert [point["environment_steps"] for point in measured["curve"]] == [2080, 4160]
@@ -54,6 +68,10 @@ def test_the_command_writes_json_and_names_the_rungs(tmp_path: Path) -> None:
     config.write_text(f"default: {{policy_kwargs: {{features_extractor_kwargs: {json.dumps(SMALL)}}}}}")
     result = runner.invoke(app, ["ladder", "stairs", "--config", str(config)])
     assert result.exit_code == 2 and "state, screen, seen, probe, teach, overfit" in result.output
+    result = runner.invoke(app, ["ladder", "teach", "--config", str(config), "--set", "stride=[2]"])
+    assert result.exit_code != 0 and "strides" in f"{result.stderr}{result.exception}"
+    result = runner.invoke(app, ["ladder", "probe", "--config", str(config), "--policy", str(BEST)])
+    assert result.exit_code == 2 and "--policy is an option of teach; this is rung probe" in result.stderr.replace("\n", "")
     config.write_text("default: {policy: CnnPolicy}")
     result = runner.invoke(app, ["ladder", "probe", "--config", str(config)])
     assert result.exit_code == 2 and "has no policy_kwargs for cartpole-swingup" in result.stderr.replace("\n", "")

@@ -1,6 +1,6 @@
 """Commands that measure what a task allows before anything is trained: ``sb3-crc baselines | landmarks | ladder``."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,8 @@ RUNGS = ("state", "screen", "seen", "probe", "teach", "overfit")
 #: Options that only some rungs have
 OWN_OPTIONS = {
     "--config": ("screen", "probe", "teach", "overfit"),
-    "--set": ("screen",),
+    "--set": ("screen", "teach"),
+    "--policy": ("teach",),
     "--reward-scale": ("state",),
     "--error": ("seen",),
     "--n-steps": ("seen",),
@@ -75,6 +76,7 @@ def landmarks(
     Group.TASKS,
     "sb3-crc ladder probe cartpole-swingup",
     "sb3-crc ladder seen --error 0.03 --n-steps 1 --n-steps 3 --output seen_3cm.json",
+    'sb3-crc ladder teach --set "strides=[2, 2, 1, 1]" --policy results/laptop/cartpole-swingup/policy.sb3crc',
     "sb3-crc ladder screen finger-spin --set n_steps=1 --set reward_scale=1 --evaluations 10",
 )
 def ladder(
@@ -96,7 +98,12 @@ def ladder(
         ),
     ] = None,
     changes: Annotated[
-        list[str] | None, typer.Option("--set", help="name=value: another setting, rung screen; once for each.")
+        list[str] | None,
+        typer.Option("--set", help="name=value: another setting, rung screen, or argument of the encoder, rung teach."),
+    ] = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(help="Exported policy that leads to the frames, with random actions between its own, rung teach."),
     ] = None,
     reward_scale: Annotated[float | None, typer.Option(help="Factor on the rewards, rung state; else 1.")] = None,
     error: Annotated[
@@ -121,7 +128,7 @@ def ladder(
     own: dict[str, Any] = {"reward_scale": reward_scale, "target_entropy": target_entropy, "agent_steps": agent_steps}
     own |= {"falling_rates": falling_rates or None, "evaluations": evaluations}
     own = {name: value for name, value in own.items() if value is not None}
-    _check_options(rung, {**own, "config": config, "set": changes, "error": error, "n_steps": n_steps})
+    _check_options(rung, {**own, "config": config, "set": changes, "error": error, "n_steps": n_steps, "policy": policy})
     config = config or LAPTOP
     policy_kwargs = _policy_kwargs(config, task) if rung in ("probe", "teach", "overfit") else {}
     encoder_kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
@@ -140,7 +147,10 @@ def ladder(
     elif rung == "probe":
         measured = rungs.probe_random_encoder(task, encoder_kwargs, seed=seed)
     elif rung == "teach":
-        measured = rungs.teach_encoder(task, encoder_kwargs, seed=seed)
+        from sb3_crc.export import ENCODER_ARGUMENTS
+
+        encoder = {**encoder_kwargs, **_changes(changes, ENCODER_ARGUMENTS)}
+        measured = rungs.teach_encoder(task, encoder, policy=policy, seed=seed)
     else:
         measured = [
             rungs.overfit_one_batch(task, name, policy_kwargs, objective_kwargs=settings, seed=seed)
@@ -161,20 +171,25 @@ def _check_options(rung: str, given: Mapping[str, Any]) -> None:
 
 
 def _screened(config: Path, task: str, changes: list[str], **own: Any) -> Mapping[str, Any]:
-    import yaml
-
     from sb3_crc.configurations import read_settings, with_overrides
     from sb3_crc.envs.tasks import environment_id
     from sb3_crc.experiments.screening import USED, screened_state_sac
 
-    settings = read_settings(config, "rad", environment_id(task))
-    for change in changes:
+    settings = with_overrides(read_settings(config, "rad", environment_id(task)), _changes(changes, USED))
+    return screened_state_sac(task, settings, **own)
+
+
+def _changes(changes: list[str] | None, allowed: Sequence[str]) -> dict[str, Any]:
+    import yaml
+
+    values = {}
+    for change in changes or []:
         name, equals, value = change.partition("=")
         if not (name and equals):
             raise typer.BadParameter(f"{change!r} is not name=value", param_hint="--set")
-        check_name("--set", name, USED)
-        settings = with_overrides(settings, {name: yaml.safe_load(value)})
-    return screened_state_sac(task, settings, **own)
+        check_name("--set", name, allowed)
+        values[name] = yaml.safe_load(value)
+    return values
 
 
 def _policy_kwargs(config: Path, task: str) -> Mapping[str, Any]:
