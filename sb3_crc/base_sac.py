@@ -169,6 +169,11 @@ class BaseCRCSAC(CheckedSAC):
         losses = {*LOSSES, *(f"representation/{name}" for name in self.policy.objectives)}
         return self._early_updates.taken() or LossHistory(self._n_updates + 1, losses)
 
+    def _objectives_due(self) -> bool:
+        """Whether this update trains by them: of what they ask at a rate of 0 only ``joint_update`` makes anything."""
+        rate = self._lr_schedules["encoder_learning_rate"](self._current_progress_remaining)
+        return self._n_updates % self.auxiliary_interval == 0 and (rate > 0 or self.joint_update)
+
     def _record(self, history: LossHistory, batch_size: int) -> None:
         super()._record(history, batch_size)
         for name in self._optimizers():
@@ -346,9 +351,8 @@ class BaseCRCSAC(CheckedSAC):
             self._weight_tensors[name].fill_(weight)
         if self._n_updates % HEALTH_INTERVAL == 0:
             return self._update(views)
-        intervals = self.policy_delay, self.target_update_interval, self.auxiliary_interval
-        due = tuple(self._n_updates % interval == 0 for interval in intervals)
-        return self._recorded(views, (*due, views.has_next))  # the last changes when n_steps does
+        due = tuple(self._n_updates % interval == 0 for interval in (self.policy_delay, self.target_update_interval))
+        return self._recorded(views, (*due, self._objectives_due(), views.has_next))  # the last changes when n_steps does
 
     def _instruments(self, views: Views) -> AbstractContextManager[dict[str, th.Tensor]]:
         if self._n_updates % HEALTH_INTERVAL != 0:

@@ -50,7 +50,7 @@ class CRCSAC(BaseCRCSAC):
     :param policy: ``"CnnPolicy"``, for Dict observations ``"MultiInputPolicy"``, or a subclass of :class:`~sb3_crc.CRCPolicy`
     :param env: environment with continuous actions and channel-first or -last uint8 images, or Dict observations with one such
         image, to whose latent the vectors beside it are joined; or the environment's id
-    :param learning_rate: of the actor; a number, a schedule of the remaining progress, or ``"lin_x"``: from x down to 0
+    :param learning_rate: of the actor; a number, or as in :func:`~sb3_crc.schedules.lr_schedule`, ``"lin_x"`` for instance
     :param buffer_size: capacity of the replay buffer, in agent steps
     :param learning_starts: agent steps with random actions before the first update
     :param batch_size: transitions per update
@@ -60,7 +60,8 @@ class CRCSAC(BaseCRCSAC):
     :param policy_delay: updates between two updates of actor and temperature
     :param ent_coef: temperature, as in SAC
     :param qf_learning_rate: of Q heads and encoder under the critic loss; None: ``learning_rate``
-    :param encoder_learning_rate: of encoder and objectives under the auxiliary losses; None: ``learning_rate``
+    :param encoder_learning_rate: of encoder and objectives under the auxiliary losses, which rest while it is 0 (but not with
+        ``joint_update``); None: ``learning_rate``
     :param ent_coef_learning_rate: of the temperature; None: ``learning_rate``
     :param objectives: name -> weight, or name -> ``{"weight": w, **settings}``; ``{}``: no auxiliary losses
     :param augmentation: name in :data:`~sb3_crc.augmentations.AUGMENTATIONS`
@@ -305,7 +306,7 @@ class CRCSAC(BaseCRCSAC):
         gradients = gradients_of([critic_loss], [*latents, *self.critic.head_parameters()])
         td_gradients, head_gradients = cast("tuple[th.Tensor, ...]", gradients[: len(latents)]), gradients[len(latents) :]
         metrics = {"train/critic_loss": critic_loss.detach()}
-        optimizer = self.policy.encoder_optimizer if self._n_updates % self.auxiliary_interval == 0 else None
+        optimizer = self.policy.encoder_optimizer if self._objectives_due() else None
         if optimizer is None or self.reencode:
             metrics |= self._step("critic", self.critic.optimizer, [*views.backward(td_gradients, encoder), *head_gradients])
         if self.reencode:

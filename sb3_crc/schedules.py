@@ -9,20 +9,25 @@ LearningRate = float | str | Schedule
 
 def lr_schedule(learning_rate: LearningRate) -> FloatSchedule:
     """
-    :param learning_rate: a number, a schedule of the remaining progress (1 to 0), or ``"lin_x"``: from x down to 0
+    :param learning_rate: a number, a schedule of the remaining progress (1 to 0), ``"lin_x"``: from x down to 0 at the end, or
+        ``"lin_x_f"``: from x down to 0 when a share f of the training is done, and 0 from there on
     :return: learning rate as a function of the remaining progress
     :raises ValueError: for any other string
     """
-    if isinstance(learning_rate, str):
-        kind, _, start = learning_rate.partition("_")
-        try:
-            value = float(start)
-        except ValueError:
-            kind = "unknown"
-        if kind != "lin":
-            raise ValueError(f"unknown learning rate {learning_rate!r}; expected a number, a schedule or 'lin_x', x a number")
-        return FloatSchedule(LinearSchedule(value, 0.0, 1.0))
-    return FloatSchedule(learning_rate)
+    if not isinstance(learning_rate, str):
+        return FloatSchedule(learning_rate)
+    kind, *numbers = learning_rate.split("_")
+    try:
+        start, share = (float(number) for number in [*numbers, "1"][:2])
+        known = kind == "lin" and len(numbers) <= 2 and 0 < share <= 1
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(
+            f"unknown learning rate {learning_rate!r}; expected a number, a schedule, 'lin_x' or 'lin_x_f', x a number and f "
+            "the share of the training, above 0 and at most 1, after which 0 is reached"
+        )
+    return FloatSchedule(LinearSchedule(start, 0.0, share))
 
 
 def check_learning_rate(name: str, value: float) -> None:

@@ -105,7 +105,9 @@ def test_learning_rates_are_separate_and_follow_their_schedules() -> None:
     optimizers = model.actor.optimizer, model.critic.optimizer, model.policy.encoder_optimizer, model.ent_coef_optimizer
     assert [o.param_groups[0]["lr"] for o in optimizers] == pytest.approx([0.005, 0.002, 0.015, 0.005])
     assert model.ent_coef_optimizer.param_groups[0]["betas"] == (0.5, 0.999)
-    for bad in ("linear_1", "lin", "0.1"):
+    early = lr_schedule("lin_0.02_0.5")
+    assert [early(remaining) for remaining in (1, 0.75, 0.5, 0.4, 0)] == pytest.approx([0.02, 0.01, 0, 0, 0])
+    for bad in ("linear_1", "lin", "0.1", "lin_1_0", "lin_1_1.5", "lin_1_x", "lin_1_1_1", "lin_1_nan"):
         with pytest.raises(ValueError, match=f"{bad!r}.*lin_x"):
             lr_schedule(bad)
 

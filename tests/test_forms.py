@@ -104,6 +104,23 @@ def test_objectives_can_step_at_every_second_update_only(reencode: bool) -> None
     assert "representation/contrastive" in model.logger.name_to_value
 
 
+@pytest.mark.parametrize("form", [{}, {"reencode": True}, {"joint_update": True}])
+def test_objectives_rest_while_their_rate_is_zero(form: dict[str, Any]) -> None:
+    """They are not computed then; jointly with the critic they still reach the encoder, by the critic's rate."""
+    model = make_model(encoder_learning_rate="lin_0.01_0.5", qf_learning_rate=0.001, **form)
+    computed: list[int] = []
+    model.policy.objectives["contrastive"].register_forward_hook(lambda *_: computed.append(model._n_updates))
+    for remaining in (1.0, 0.6, 0.4):
+        model._current_progress_remaining = remaining
+        own = [parameter.detach().clone() for parameter in model.policy.objectives.parameters()]
+        encoder = [parameter.detach().clone() for parameter in model.critic.features_extractor.parameters()]
+        model.train(gradient_steps=1, batch_size=16)
+        moved = not all(map(th.equal, own, model.policy.objectives.parameters()))
+        assert moved == (remaining > 0.5)
+        assert not all(map(th.equal, encoder, model.critic.features_extractor.parameters()))  # by the critic at least
+    assert computed == ([1, 2, 3] if "joint_update" in form else [1, 2])
+
+
 def test_an_interval_of_no_updates_is_refused() -> None:
     with pytest.raises(ValueError, match="auxiliary_interval=0 must be an integer >= 1"):
         make_model(auxiliary_interval=0)

@@ -101,8 +101,9 @@ LONGER = dict.fromkeys(("crc_release", "drq", "sac_ae"), pytest.mark.slow)
         {"joint_update": True, "policy_delay": 3, "n_steps": 3},
         {"balance": "grad_norm", "auxiliary_interval": 2, "max_grad_norm": 1.0, "ent_coef": 0.1},
         {"objectives": {"contrastive": {"weight": 1.0, "key": "next"}}, "n_steps": 3, "augmentation": "random_shift"},
+        {"encoder_learning_rate": "lin_0.01_0.5"},
     ],
-    ids=[*PRESETS, "joint", "balanced", "next"],
+    ids=[*PRESETS, "joint", "balanced", "next", "resting"],
 )
 def test_replayed_updates_are_those_that_python_makes(own: dict[str, Any]) -> None:
     models = recorded(**own), recorded(Direct(), **own)
@@ -158,6 +159,7 @@ def test_learning_rates_and_weights_reach_what_was_recorded() -> None:
     before = [tensor.detach().clone() for tensor in model.policy.critic.parameters()]
     model.train(gradient_steps=4, batch_size=16)
     assert all(map(th.equal, before, model.policy.critic.parameters()))  # the rate is zero
+    model._current_progress_remaining = 0.5
     model._objective_weights = {"contrastive": 0.0, "reconstruction": 2.0}
     model.train(gradient_steps=2, batch_size=16)
     logged = model.logger.name_to_value

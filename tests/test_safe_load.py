@@ -82,13 +82,12 @@ def test_our_own_files_unpickle_nothing(tmp_path: Path, settings: dict[str, Any]
     assert loaded.lr_schedule(0.5) == model.lr_schedule(0.5)
 
 
-@pytest.mark.parametrize("learning_rate", ["lin_0.001", 0.001])
-def test_what_the_zoo_trains_is_saved_without_pickles(learning_rate: float | str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("learning_rate", "share"), [("lin_0.001", 0.25), ("lin_0.001_0.9", 1 / 6), (0.001, 1)])
+def test_what_the_zoo_trains_is_saved_without_pickles(learning_rate: float | str, share: float, tmp_path: Path) -> None:
     settings = CRCExperimentManager._preprocess_schedules({"learning_rate": learning_rate, "batch_size": 8})
     assert settings["batch_size"] == 8 and callable(settings["learning_rate"])
     make_model(learning_rate=settings["learning_rate"]).save(tmp_path / "model")
     loaded = CRCSAC.load(tmp_path / "model", device="cpu", safe=True)
-    share = 0.25 if isinstance(learning_rate, str) else 1
     assert loaded.lr_schedule(0.25) == pytest.approx(0.001 * share) and loaded.learning_rate(0.25) == loaded.lr_schedule(0.25)  # type: ignore[operator]
 
 

@@ -34,6 +34,7 @@ from sb3_crc.experiments.curves import plot_learning_curve
 from sb3_crc.experiments.provenance import provenance
 from sb3_crc.experiments.runs import PROVENANCE, add_provenance, write_json
 from sb3_crc.presets import PRESETS
+from sb3_crc.schedules import lr_schedule
 from sb3_crc.stock import STOCK
 from sb3_crc.workers import WatchedSubprocVecEnv, WorkerError
 from sb3_crc.zoo.messages import say
@@ -99,12 +100,15 @@ class CRCExperimentManager(ExperimentManager):
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
-        """SB3's linear schedule in place of rl_zoo3's: the same rates, and saved without a pickle."""
-        found: dict[str, Any] = ExperimentManager._preprocess_schedules(hyperparams)
+        """As in the zoo, but SB3's linear schedules, saved without a pickle, and a learning rate may be ``lin_x_f``."""
+        rate = hyperparams.get("learning_rate")
+        own = {"learning_rate": lr_schedule(rate).value_schedule} if isinstance(rate, str) else {}
+        others = {name: value for name, value in hyperparams.items() if name not in own}
+        found: dict[str, Any] = ExperimentManager._preprocess_schedules(others)
         for name, value in found.items():
             if isinstance(value, SimpleLinearSchedule):
                 found[name] = LinearSchedule(value.initial_value, 0.0, 1.0)
-        return found
+        return found | own
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if "ParallelTrainCallback" in str(hyperparams.get("callback")):
