@@ -78,6 +78,7 @@ class BaseCRCSAC(CheckedSAC):
     compile: bool
     policy_delay: int
     auxiliary_interval: int
+    joint_update: bool
     _objective_weights: dict[str, float]
     _weight_tensors: dict[str, th.Tensor]
     _early_updates: EarlyUpdates
