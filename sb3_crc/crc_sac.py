@@ -50,7 +50,7 @@ class CRCSAC(BaseCRCSAC):
     :param policy: ``"CnnPolicy"``, for Dict observations ``"MultiInputPolicy"``, or a subclass of :class:`~sb3_crc.CRCPolicy`
     :param env: environment with continuous actions and channel-first or -last uint8 images, or Dict observations with one such
         image, to whose latent the vectors beside it are joined; or the environment's id
-    :param learning_rate: of the actor; a number, or as in :func:`~sb3_crc.schedules.lr_schedule`, ``"lin_x"`` for instance
+    :param learning_rate: of the actor; a number, a schedule, ``"lin_x"`` (from x down to 0), ``"lin_x_f"`` (0 from share f on)
     :param buffer_size: capacity of the replay buffer, in agent steps
     :param learning_starts: agent steps with random actions before the first update
     :param batch_size: transitions per update
