@@ -117,7 +117,7 @@ def test_values_that_cannot_be(name: str) -> None:
         (["baselines", "cartpole-swingup", "--episodes", "1"], "Invalid value for '--episodes'"),
         (["landmarks", "--task", "walker"], "Unknown task 'walker'"),
         (["ladder", "stairs"], "'stairs' is none of state, screen, seen, probe, teach, overfit"),
-        (["ladder", "probe", "--set", "n_steps=1"], "--set is an option of screen; this is rung probe"),
+        (["ladder", "probe", "--set", "n_steps=1"], "--set is an option of screen and teach; this is rung probe"),
         (["ladder", "seen", "--reward-scale", "0"], "--reward-scale is an option of state; this is rung seen"),
         (["table", "200k", "{csv}"], "200k"),
         (["contact-sheet", "--tasks", "cartpole"], "Unknown task 'cartpole'"),

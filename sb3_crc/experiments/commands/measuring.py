@@ -76,7 +76,7 @@ def landmarks(
     Group.TASKS,
     "sb3-crc ladder probe cartpole-swingup",
     "sb3-crc ladder seen --error 0.03 --n-steps 1 --n-steps 3 --output seen_3cm.json",
-    'sb3-crc ladder teach --set "strides=[2, 2, 1, 1]" --policy results/laptop/cartpole-swingup/policy.sb3crc',
+    'sb3-crc ladder teach --set "strides=[2, 2, 1, 1]" --policy policy.sb3crc',
     "sb3-crc ladder screen finger-spin --set n_steps=1 --set reward_scale=1 --evaluations 10",
 )
 def ladder(
