@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_crc.experiments.comparison_summary import difference_table, markdown
-from sb3_crc.experiments.pairs import compare_by_task
+from sb3_crc.experiments.pairs import compare_by_task, ranges
 from sb3_crc.experiments.published import SIX_TASKS, published, read_published
 from sb3_crc.experiments.runs import read_json
-from sb3_crc.experiments.scores import BETWEEN, final_means, one_protocol, read_scores
+from sb3_crc.experiments.scores import BETWEEN, Missing, final_means, one_protocol, read_scores
 from sb3_crc.experiments.statistics import ENOUGH_SEEDS, HIGHEST_RETURN, NOT_RESOLVED, aggregate
 from sb3_crc.presets import PRESETS
 from sb3_crc.settings import check_name
@@ -69,7 +69,7 @@ def results_page(
     lines += _conditions(final)
     if trials:
         lines += _trials(trials)
-    absent = [f"- {missing}" for missing in scores.missing]
+    absent = [f"- {line}" for line in _missing(scores.missing)]
     absent += [f"- no run on {task}" for task in SIX_TASKS if task not in set(means["task"])]
     absent += [f"- no run of {name}" for name in (*PRESETS, *STOCK) if name not in set(means["method"])]
     if absent:
@@ -143,6 +143,15 @@ def _compared(means: "pd.DataFrame", baselines: Sequence[str]) -> Iterator[str]:
     )
     if left_out := dict.fromkeys(one for _, absent in compared.values() for one in absent):
         yield from ["In no row:", "", *(f"- {one}" for one in left_out), ""]
+
+
+def _missing(runs: Sequence[Missing]) -> Iterator[str]:
+    """:return: a line for each method, task and reason"""
+    seeds: dict[tuple[str, str, str], list[int]] = {}
+    for one in runs:
+        seeds.setdefault((one.method, one.task, one.reason), []).append(one.seed)
+    for (method, task, reason), numbers in seeds.items():
+        yield f"{method} on {task}, seed{'s' * (len(numbers) > 1)} {ranges(sorted(numbers))}: {reason}"
 
 
 def _conditions(final: "pd.DataFrame") -> Iterator[str]:

@@ -64,6 +64,7 @@ def test_each_method_is_compared_on_the_seeds_that_it_shares_with_the_baseline(t
     assert "| rad | cartpole-swingup | 0, 1, 2 | -17 (" in page  # one seed of stock SAC costs rad none
     assert "| sac | cartpole-swingup | 1 | -760 | not resolved (one seed" in page
     assert "- sac on cartpole-swingup: no sac with seed 0, 2" in page
+    assert "- sac on cartpole-swingup, seeds 0, 2: absent" in page  # a line for the runs that lack the same
 
 
 def test_methods_are_compared_with_each_baseline_that_is_named(tmp_path: Path) -> None:
